@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 
@@ -51,6 +52,21 @@ object = "rib_bone:2"
 """
 
 
+SIDECAR = """
+[instrument]
+pixel_mm = 0.1
+bits = 16
+[[series]]
+kind = "dark"
+files = "dark_*.tif"
+exposure_ms = 20
+[[series]]
+kind = "flat"
+files = "flat_*.tif"
+exposure_ms = 20
+kV = 60
+power_W = 30
+"""
 SMALL_PRODUCTS = """
 [[product]]
 shape = "fillet"
@@ -81,6 +97,12 @@ def folder(tmp_path_factory, make_sweep_line, make_tiny_session):
     make_tiny_session(place / "session.h5")
     rt.calibrate(place / "session.h5", seed=0).save(place / "session_twin.h5")
     (place / "campaign.toml").write_text(CAMPAIGN)
+    (place / "frames").mkdir()
+    (place / "frames" / "raytwin.toml").write_text(SIDECAR)
+    for seed, name in enumerate(("dark_1", "dark_2", "flat_1", "flat_2")):
+        level_DN = 2000.0 if name.startswith("flat") else 100.0
+        frame = np.random.default_rng(seed).normal(level_DN, 5.0, (16, 20)).astype(np.uint16)
+        tifffile.imwrite(place / "frames" / f"{name}.tif", frame, photometric="minisblack")
     write_hits(place / "hits.csv", HITS["hit"])
     write_hits(place / "other_hits.csv", [0, 0, 0, 0, 1, 1, 1, 0, 1, 1, 1, 1])
     return place
@@ -163,6 +185,7 @@ RESULTS = {
             *("--family", "none"),
         ],
     ),
+    "import": (lambda: rt.import_data("frames", "frames.h5"), ["import", "images", "frames", "-o", "frames.h5"]),
     "check": (lambda: rt.check("session.h5"), ["check", "session.h5"]),
     "info": (rt.info, ["info"]),
     "export": (
@@ -400,6 +423,13 @@ def closed():
         ),
         (lambda: rt.calibrate("session.h5", progress=3), "progress: got 3"),
         (lambda: rt.validate("session_twin.h5", None), "acquisition: got NoneType"),
+        (lambda: rt.import_data("frames", "x.h5", layout="tiff"), "layout: got 'tiff'; expected one of images, dicom"),
+        (lambda: rt.import_data("frames", "x.h5", exposure_ms=3), "exposure_ms: got a word of layout images"),
+        (lambda: rt.import_data("s", "x.h5", layout="xtekct", exposure_ms="3"), "got '3'; expected a number, in ms"),
+        (lambda: rt.import_data("s", "x.h5", layout="zenodo", kV=-3), "kV: got -3 kV; expected a finite value above 0"),
+        (lambda: rt.import_data("frames", "x.h5", twin="twin.h5"), "twin: got one for layout images"),
+        (lambda: rt.import_data(3, "x.h5"), "source: got 3 (int); expected the path of a folder or file"),
+        (lambda: rt.import_data("nowhere", "x.h5"), "nowhere"),
         (lambda: rt.check(3), "got 3 (int)"),
         (lambda: rt.check(closed()), "session.h5: got a closed file"),
         (lambda: rt.calibrate(closed()), "session.h5: got a closed file"),

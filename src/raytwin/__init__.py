@@ -4,7 +4,7 @@
     twin = rt.calibrate("session.h5")
     twin.predict(kV=60, power_W=30, exposure_ms=20, filter="Cu:0.1")
 
-Every command of `raytwin` has its function here; docs/python.md lists them. Names are loaded when they are first asked for.
+Commands of `raytwin` have their functions here; docs/python.md lists them. Names are loaded when they are first asked for.
 The packages (`raytwin.materials`, `raytwin.spectra`, ...) hold the functions on arrays; see ARCHITECTURE.md for the map.
 """
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .api.images import generate as generate
     from .api.images import read_dataset as read_dataset
     from .api.images import train as train
+    from .api.imports import import_data as import_data
     from .api.observers import calibrate_observer as calibrate_observer
     from .api.observers import observe as observe
     from .api.reports import report as report
@@ -58,6 +59,7 @@ _HOME = {
     "export": "api.about",
     "fit_pod": "api.curves",
     "generate": "api.images",
+    "import_data": "api.imports",
     "info": "api.about",
     "lab_session": "api.sessions",
     "mu": "api.beams",
@@ -93,6 +95,7 @@ __all__ = [
     "export",
     "fit_pod",
     "generate",
+    "import_data",
     "info",
     "lab_session",
     "mu",

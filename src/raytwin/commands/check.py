@@ -8,12 +8,14 @@ calibration or stop it.
 import argparse
 import shutil
 import textwrap
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ._answer import answer, say
 
 if TYPE_CHECKING:
     from ..calibration.check import CheckResult
+    from ..calibration.findings import Finding
 
 EXAMPLE = """example:
   raytwin check session.h5
@@ -41,9 +43,9 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def say_short(result: "CheckResult") -> None:
+def say_short(findings: "Sequence[Finding]") -> None:
     """The short form that an import ends with: the findings that matter, one line each, on standard error."""
-    told = [item for item in result.findings if item.severity != "note"]
+    told = [item for item in findings if item.severity != "note"]
     for item in told[:8]:
         say(f"{item.severity}: {item.series + ': ' if item.series else ''}{item.text}")
     if len(told) > 8:

@@ -14,10 +14,10 @@ reference your own dual-energy images with masks, or an acquisition with scenes 
 
 import argparse
 import importlib
-from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any
 
+from ..api._progress import Bar
+from ..api.imports import LAYOUTS, import_data
 from ..errors import InputError
 from ..results import counted
 from ._answer import answer, say
@@ -32,21 +32,12 @@ EXAMPLE = """examples:
   raytwin import zenodo Submission --select "Dataset #1" -o set1.h5
   raytwin import reference session.h5 -o reference.h5 --low kv=40,exposure_ms=100 --high kv=90,exposure_ms=100"""
 
-_LAYOUTS = {
-    "images": "a folder of TIFF, PNG, FITS, DICOM, HIS, EDF or raw images with a sidecar",
-    "dicom": "DICOM or DICONDE images: a folder, or one file",
-    "xtekct": "a Nikon .xtekct file with its projections",
-    "nxtomo": "a NeXus NXtomo file",
-    "emva1288": "a folder with EMVA1288_Data.txt",
-    "zenodo": "the paper's data: processed images, a raw session or calibration flats",
-    "reference": "dual-energy images with masks: a folder with a sidecar, or an acquisition file",
-}
 _SHOWN = 12
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     layouts = parser.add_subparsers(dest="layout", metavar="LAYOUT", required=True)
-    for name, line in _LAYOUTS.items():
+    for name, line in LAYOUTS.items():
         layout = layouts.add_parser(
             name,
             help=line,
@@ -83,113 +74,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ..acquisition import open_acquisition
-    from ..calibration.findings import Severity
     from .check import say_short
 
-    report = _import(arguments)
-    notes = list(report.notes)
-    if report.format == "acquisition":
-        with open_acquisition(report.written) as acquisition:
-            notes += [line for line in acquisition.missing if line not in notes]
-    for skipped in report.skipped[:_SHOWN]:
+    layout, words = arguments.layout, _words(arguments)
+    with Bar(only_on_terminal=True, unit="image") as progress:
+        found = import_data(arguments.source, arguments.out, layout=layout, progress=progress, **words)
+    for skipped in found.skipped[:_SHOWN]:
         say(f"skipped {skipped.what}: {skipped.reason}")
-    if len(report.skipped) > _SHOWN:
-        say(f"skipped {len(report.skipped) - _SHOWN} more (all of them with --json)")
-    result: dict[str, Any] = asdict(report) | {"notes": notes}
-    if report.format == "acquisition":
-        from ..calibration.check import check_acquisition
-
-        checked = check_acquisition(report.written)
-        result["findings"] = [item.to_dict() for item in checked.findings if item.severity != Severity.NOTE]
-        say_short(checked)
+    if len(found.skipped) > _SHOWN:
+        say(f"skipped {len(found.skipped) - _SHOWN} more (all of them with --json)")
+    say_short(found.findings)
+    result = found.to_dict()
     answer(result, as_json=arguments.json, text=_text(result))
     return 0
 
 
-def _import(arguments: argparse.Namespace) -> Any:
-    source, out = arguments.source, arguments.out
-    with _Bar() as progress:
-        if arguments.layout == "images":
-            from ..acquisition.images import import_images
-
-            return import_images(source, out, sidecar=arguments.sidecar, progress=progress)
-        if arguments.layout == "nxtomo":
-            from ..acquisition.nxtomo import import_nxtomo
-
-            return import_nxtomo(source, out, detector=arguments.detector, progress=progress)
-        if arguments.layout == "emva1288":
-            from ..acquisition.emva1288 import import_emva1288
-
-            return import_emva1288(source, out, progress=progress)
-        if arguments.layout == "dicom":
-            from ..acquisition.dicom import import_dicom
-
-            return import_dicom(source, out, progress=progress)
-        if arguments.layout == "xtekct":
-            from ..acquisition.xtekct import import_xtekct
-
-            exposure_ms = _positive(arguments.exposure_ms, "--exposure-ms", "ms")
-            return import_xtekct(source, out, exposure_ms=exposure_ms, progress=progress)
-        if arguments.layout == "zenodo":
-            from ..acquisition.zenodo import import_zenodo
-
-            return import_zenodo(
-                source,
-                out,
-                select=arguments.select,
-                kV=_positive(arguments.kv, "--kv", "kV"),
-                exposure_ms=_positive(arguments.exposure_ms, "--exposure-ms", "ms"),
-                progress=progress,
-            )
-        import numpy as np
-
-        from ..acquisition import setting_from_text
-        from ..acquisition.reference import import_reference
-
-        return import_reference(
-            source,
-            out,
-            sidecar=arguments.sidecar,
-            low=None if arguments.low is None else setting_from_text(arguments.low),
-            high=None if arguments.high is None else setting_from_text(arguments.high),
-            each_frame=arguments.each_frame,
-            dilations=arguments.ring_px,
-            validation=arguments.validation,
-            test=arguments.test,
-            rng=np.random.default_rng(arguments.seed),
-            bad_pixels=None if arguments.twin is None else _bad_pixels(arguments.twin),
-            progress=progress,
-        )
-
-
-def _bad_pixels(twin: str) -> Any:
-    from ..api._given import as_twin
-
-    return as_twin(twin).maps.bad_pixels > 0
+def _words(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The options of a layout as `rt.import_data` calls them."""
+    if arguments.layout == "images":
+        return {"sidecar": arguments.sidecar}
+    if arguments.layout == "nxtomo":
+        return {"detector": arguments.detector}
+    if arguments.layout == "xtekct":
+        return {"exposure_ms": _positive(arguments.exposure_ms, "--exposure-ms", "ms")}
+    if arguments.layout == "zenodo":
+        return {
+            "select": arguments.select,
+            "kV": _positive(arguments.kv, "--kv", "kV"),
+            "exposure_ms": _positive(arguments.exposure_ms, "--exposure-ms", "ms"),
+        }
+    if arguments.layout == "reference":
+        names = ("sidecar", "low", "high", "each_frame", "ring_px", "validation", "test", "seed", "twin")
+        return {name: getattr(arguments, name) for name in names}
+    return {}
 
 
 def _positive(value: float | None, name: str, unit: str) -> float | None:
     if value is not None and not 0 < value < float("inf"):
         raise InputError(name, received=f"{value} {unit}", expected=f"a finite value above 0 {unit}")
     return value
-
-
-class _Bar:
-    """A progress bar on a terminal, nothing elsewhere."""
-
-    def __enter__(self) -> Callable[[int, int], None]:
-        from tqdm import tqdm
-
-        self._tqdm: Any = tqdm(unit="image", disable=None, leave=False)
-        return self._step
-
-    def _step(self, done: int, total: int) -> None:
-        self._tqdm.total = total
-        self._tqdm.update(done - self._tqdm.n)
-
-    def __exit__(self, *_: object) -> None:
-        self._tqdm.close()
 
 
 def _text(result: dict[str, Any]) -> str:

@@ -348,6 +348,16 @@ def test_seeds_may_be_generators_and_progress_a_function(inside, capsys):
         rt.calibrate("session.h5", seed="now")
 
 
+def test_whole_numbers_of_numpy_are_whole_numbers(inside):
+    one, two, sixteen = np.int64(1), np.int32(2), np.int64(16)
+    words = {"protocol": "calibration", "frames": two, "families": ()}
+    found = rt.lab_session("numpy.h5", seed=one, size=sixteen, **words)
+    assert found.to_dict() == rt.lab_session("numpy.h5", seed=1, size=16, **words).to_dict()
+    assert rt.calibrate("session.h5", seed=one) == rt.calibrate("session.h5", seed=1)
+    many = rt.fit_pod("hits.csv", link="logit", bootstrap=np.int64(20), seed=one)
+    assert many.to_dict() == rt.fit_pod("hits.csv", link="logit", bootstrap=20, seed=1).to_dict()
+
+
 def test_open_files_are_a_short_table_and_open_again_from_a_pickle(inside):
     with rt.open_acquisition("session.h5") as session, rt.read_dataset("references.h5") as dataset:
         for opened in (session, dataset):
@@ -413,6 +423,8 @@ def closed():
         (lambda: rt.contrast(product="water:1", foreign_object="Al:1", low=LOW, high=HIGH, swan=1), "swan"),
         (lambda: rt.fit_pod(3), "table: got int"),
         (lambda: rt.lab_session("x.h5", protocol="calibration", sizes=3), "sizes"),
+        (lambda: rt.lab_session("x.h5", protocol="calibration", size="16"), "size: got '16'; expected N or (rows"),
+        (lambda: rt.lab_session("x.h5", protocol="calibration", size=(16, 4)), "size: got (16, 4); expected N or"),
         (lambda: rt.diagnose("session.h5", task={"measured": "x"}), "an output folder"),
         (lambda: rt.export("twin.h5", "x", to="geant4"), "one of csv, gvxr"),
         (lambda: rt.calibrate(3), "acquisition: got int"),

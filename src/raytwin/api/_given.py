@@ -181,3 +181,14 @@ def whole_seed(seed: "int | np.random.Generator") -> int:
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise InputError("seed", received=repr(seed), expected="a whole number, 0 or more, or a numpy Generator")
     return int(seed)
+
+
+def seed_number(seed: "int | np.random.Generator") -> int | None:
+    """The seed, for the record; None of a generator, which no number stands for.
+
+    Raises:
+        InputError: anything else than a whole number of 0 or more or a generator.
+    """
+    import numpy as np
+
+    return None if isinstance(seed, np.random.Generator) else whole_seed(seed)

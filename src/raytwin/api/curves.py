@@ -613,9 +613,11 @@ def _bootstrap(
     seed: "int | np.random.Generator",
     warnings: list[str],
 ) -> dict[str, Any]:
+    import numpy as np
+
     from ..pod import bootstrap_pod
 
-    if isinstance(replicates, bool) or not isinstance(replicates, int) or replicates < 20:
+    if isinstance(replicates, bool) or not isinstance(replicates, int | np.integer) or replicates < 20:
         raise InputError("bootstrap", received=replicates, expected="20 refits or more (1000 is usual)")
     if by is None:
         known = table.network is not None, table.image is not None
@@ -627,7 +629,7 @@ def _bootstrap(
         link=fit.link,
         log_size=fit.log_size,
         by=by,
-        replicates=replicates,
+        replicates=int(replicates),
         rng=generator_of(seed),
     )
     if None in (found.a90_95, found.a90_low, found.a90_high) and found.unknown < 0.025:
@@ -636,7 +638,7 @@ def _bootstrap(
         )
     return {
         "by": by,
-        "replicates": replicates,
+        "replicates": int(replicates),
         "a90_95": found.a90_95,
         "a90_low": found.a90_low,
         "a90_high": found.a90_high,

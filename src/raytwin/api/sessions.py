@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InputError
 from ..results import Result, Table, axes_or_new, frame, plain
 from ._folder import check_effects, written_folder
-from ._given import PathLike, acquisition_sha256, as_twin, generator_of, listed, opened, twin_sha256, whole_seed
+from ._given import (
+    PathLike,
+    acquisition_sha256,
+    as_twin,
+    generator_of,
+    listed,
+    opened,
+    seed_number,
+    twin_sha256,
+    whole_seed,
+)
 from ._progress import Progress, Telling
 
 if TYPE_CHECKING:
@@ -111,6 +121,8 @@ def lab_session(
     """
     from inspect import signature
 
+    import numpy as np
+
     from ..acquisition.acquisition_io import open_acquisition
     from ..lab.effects import request_from_text
     from ..lab.protocols import run_protocol, truth_path
@@ -128,9 +140,10 @@ def lab_session(
         texts = [f"{name}={strength}" for name, strength in effects.items()]
     requests = [request_from_text(text) for text in texts]
     if size is not None:
-        rows, columns = (size, size) if isinstance(size, int) else size
-        if not all(8 <= pixels <= 8192 for pixels in (rows, columns)):
+        sides = np.atleast_1d(np.asarray(size))
+        if sides.dtype.kind not in "iu" or sides.shape not in ((1,), (2,)) or sides.min() < 8 or sides.max() > 8192:
             raise InputError("size", received=repr(size), expected="N or (rows, columns) from 8 to 8192 pixels")
+        rows, columns = (int(side) for side in np.broadcast_to(sides, 2))
         words |= {"rows": rows, "columns": columns}
     with Telling(progress, unit="frame") as telling:
         truth = run_protocol(
@@ -227,7 +240,7 @@ def diagnose(
     from ..generator.effects import EFFECTS
 
     check_effects("without", without, tuple(EFFECTS))
-    number = seed if isinstance(seed, int) and not isinstance(seed, bool) else None
+    number = seed_number(seed)
     rng = generator_of(seed)
     known = None if twin is None else as_twin(twin)
     if task is not None and (output is None or plan_only):

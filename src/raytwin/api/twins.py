@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from ._given import PathLike, acquisition_sha256, as_any_twin, as_twin, generator_of, listed, opened
+from ._given import PathLike, acquisition_sha256, as_any_twin, as_twin, generator_of, listed, opened, seed_number
 from ._progress import Progress, Telling
 
 if TYPE_CHECKING:
@@ -108,7 +108,8 @@ def calibrate(
         measured = [spectrum_from_file(path, kV=float(kV)) for kV, path in spectra.items()]
     else:
         measured = list(spectra)
-    provenance = {"raytwin_version": __version__, "seed": seed if isinstance(seed, int) else "a generator"}
+    number = seed_number(seed)
+    provenance = {"raytwin_version": __version__, "seed": "a generator" if number is None else number}
     for name, path in (("output_table", output_table), ("transmission", transmission)):
         if path is not None:
             with suppress(OSError):  # the table's reader says what is wrong with such a file

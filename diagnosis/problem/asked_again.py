@@ -84,7 +84,7 @@ class AskedAgain:
             if not any(asked[row].failed for row in (*rows, *range(len(changes), len(asked))))
         }
 
-    def let_in(self, effect: AppliedEffect) -> NDArray[np.float64]:
+    def let_in(self, effect: AppliedEffect) -> NDArray[np.float64] | None:
         """What borders may let in of an effect by chance, see `light_let_in`."""
         return light_let_in(self.session, [one.probes for one in self.series], effect)
 

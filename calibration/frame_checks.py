@@ -284,7 +284,7 @@ def _change(
 
     `noise_growth` is how much more noise a mean over many blocks may have than white noise of the blocks' variance has.
     """
-    from scipy.special import chdtri  # of chi-square's upper tail; scipy.stats takes a second to import
+    from scipy.special import chdtri  # of chi-square's upper tail
 
     difference = later - earlier
     signal = float(np.mean(earlier))

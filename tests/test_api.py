@@ -440,6 +440,8 @@ def closed():
         (lambda: rt.import_data("s", "x.h5", layout="xtekct", exposure_ms="3"), "got '3'; expected a number, in ms"),
         (lambda: rt.import_data("s", "x.h5", layout="zenodo", kV=-3), "kV: got -3 kV; expected a finite value above 0"),
         (lambda: rt.import_data("frames", "x.h5", twin="twin.h5"), "twin: got one for layout images"),
+        (lambda: rt.import_data("s", "x.h5", layout="reference", ring_px="3"), "ring_px: got '3'; expected a number"),
+        (lambda: rt.import_data("frames", "x.h5", sidecar=3), "sidecar: got 3 (int); expected the path of a sidecar"),
         (lambda: rt.import_data(3, "x.h5"), "source: got 3 (int); expected the path of a folder or file"),
         (lambda: rt.import_data("nowhere", "x.h5"), "nowhere"),
         (lambda: rt.check(3), "got 3 (int)"),

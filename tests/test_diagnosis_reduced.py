@@ -717,11 +717,14 @@ def test_nuisances_act_on_what_is_there_once_an_effect_is_found(line):
     assert seen
 
 
-def test_what_stands_beyond_the_borders_is_a_random_part_of_the_effect_that_brings_it_in(line):
+def test_what_stands_beyond_the_borders_is_a_random_part_of_the_effect_that_brings_it_in(line, tmp_path):
     """Of a glare one number a placement of a scene, in its series' pictures alone; a twin's glare has it, too."""
     variants = [item for item in catalogue_variants() if item.effect == "veiling_glare" and item.since == "always"]
-    twin = read_twin(line / "twin.h5")
-    with open_acquisition(line / "session.h5") as acquisition:
+    twin, path = read_twin(line / "twin.h5"), shutil.copy(line / "session.h5", tmp_path / "two_places.h5")
+    with h5py.File(path, "r+") as file:  # an object of it elsewhere
+        (*_, last) = [one for one in file["series"].values() if one.attrs["kind"] == "object"]
+        last.attrs["source_object_mm"] = 500.0
+    with open_acquisition(path) as acquisition:
         problem = build_problem(acquisition, twin, variants=variants)
         farther = replace(variants[0], parameters={**variants[0].parameters, "length_mm": 15.0}, strengths=(2.0,))
         problem = problem.with_variants([(farther, problem.respond([farther])[0])])
@@ -736,7 +739,7 @@ def test_what_stands_beyond_the_borders_is_a_random_part_of_the_effect_that_brin
         for view in problem.views
     ]
     first, *_, last = problem.curves
-    assert first.spread.shape[1] == len({place for place in places if place is not None})
+    assert first.spread.shape[1] == len({place for place in places if place is not None}) == 2
     of_maps = np.array([name.statistic == "mean frame" for name in problem.names])
     assert not np.any(first.spread[~of_maps])
     for column in first.spread.T:

@@ -400,9 +400,8 @@ def _as_given(effect: AppliedEffect, done: NDArray[np.float64], session: Session
         high=strength,
         strengths=(strength,),
     )
-    curve = Curve(variant=variant, responses=done[None, :])
-    if EFFECTS[effect.id].variation.random == "surroundings":
-        curve = replace(curve, spread=light_let_in(session, [part.probed.probes for part in parts], effect))
+    let_in = light_let_in(session, [part.probed.probes for part in parts], effect)
+    curve = Curve(variant=variant, responses=done[None, :], spread=let_in)
     level = USUAL_LEVEL if effect.law_sd is None else min(effect.law_sd, FARTHEST_LEVEL)
     # found without an interval, or stated by hand: as intervals of strengths are widened for real laws
     sd = EFFECTS[effect.id].reading.law_sd if effect.strength_sd is None else effect.strength_sd
@@ -479,9 +478,9 @@ def _curves(
             missing.setdefault(variant.effect, failed)
             continue
         own = responses[list(rows)] + done.get(variant.effect, 0.0)
-        spread = by_chance(variant, blocks, rows[0], readout_ms)
-        if effect.variation.random == "surroundings":
-            spread = light_let_in(session, probes, variant.applied(variant.strengths[0]))
+        spread = light_let_in(session, probes, variant.applied(variant.strengths[0]))
+        if spread is None:
+            spread = by_chance(variant, blocks, rows[0], readout_ms)
         # a wandering output shifts levels by chance even where too few frames show its noise
         wanders = effect.variation.random == "output" and spread is not None and bool(np.any(spread))
         if not (wanders or float(np.max(np.abs(own))) > LEAST_RESPONSE):

@@ -202,10 +202,9 @@ class Problem:
             onset = variant.effect, variant.since
             alike = [item for item in self.curves if (item.effect, item.variant.since) == onset]
             like = next((item for item in alike if item.variant.name == variant.refined_from), alike[0])
-            curve = replace(like, variant=variant, responses=responses)
-            if EFFECTS[variant.effect].variation.random == "surroundings":
-                curve = replace(curve, spread=self._open.let_in(variant.applied(variant.strengths[-1])))
-            curves.append(curve)
+            let_in = self._open.let_in(variant.applied(variant.strengths[-1]))
+            spread = like.spread if let_in is None else let_in
+            curves.append(replace(like, variant=variant, responses=responses, spread=spread))
         return replace(self, curves=(*self.curves, *curves))
 
 

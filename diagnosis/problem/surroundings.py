@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.effects import AppliedEffect
+from ...generator.effects import EFFECTS, AppliedEffect
 from ..model import changes as scales
 from ..model.responses import SessionModel
 from .series_probes import SeriesProbes
@@ -14,7 +14,7 @@ from .series_probes import SeriesProbes
 def light_let_in(
     session: SessionModel, series: Sequence[SeriesProbes], effect: AppliedEffect
 ) -> NDArray[np.float64] | None:
-    """What an effect may let in by chance (probe, placement of a scene), a unit of its strength; None: nothing.
+    """What an effect may let in by chance (probe, placement of a scene), a unit of its strength; None: it brings nothing in.
 
     That is what comes in if the picture goes on as it ends, less what comes in if it mirrors. An edge that crosses a border and runs
     on straight lets in twice that. Series of one placement have the same surroundings.
@@ -24,6 +24,8 @@ def light_let_in(
         series: probes of all of them, in order of time.
         effect: at a strength; it takes the place of the same one, if the base has that.
     """
+    if EFFECTS[effect.id].variation.random != "surroundings":
+        return None
     columns = [_of_series(session, probes, effect) for probes in series]
     stated = [probes.series.session for probes in series]
     of = [(item.series.scene, item.request.source_object_mm) for item in stated]

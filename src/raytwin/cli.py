@@ -140,8 +140,15 @@ def _near(word: str, options: Collection[str]) -> str:
 
 
 def _options(command: argparse.ArgumentParser) -> dict[str, str]:
-    """Python's name of an argument -> the option that sets it, for messages."""
-    return {action.dest: action.option_strings[0] for action in command._actions if action.option_strings}
+    """Python's name of an argument -> the option that sets it, those of commands below it as well, for messages."""
+    found: dict[str, str] = {}
+    for action in command._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for below in action.choices.values():
+                found |= _options(below)
+        elif action.option_strings:
+            found[action.dest] = action.option_strings[0]
+    return found
 
 
 def _as_options(argument: str, options: Mapping[str, str]) -> str:

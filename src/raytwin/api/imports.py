@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     import pandas
 
     from ..acquisition.import_report import ImportReport, Skipped
-    from ..calibration.check import CheckResult
     from ..calibration.findings import Finding
     from ..generator.line.twin import Twin
 
@@ -33,7 +32,7 @@ LAYOUTS = {
     "reference": "dual-energy images with masks: a folder with a sidecar, or an acquisition file",
 }
 # layout -> its own words
-_WORDS = {
+WORDS = {
     "images": ("sidecar",),
     "nxtomo": ("detector",),
     "xtekct": ("exposure_ms",),
@@ -129,7 +128,7 @@ def import_data(
         >>> found.format, found.frames
         ('acquisition', 4)
     """
-    if layout not in LAYOUTS:
+    if not isinstance(layout, str) or layout not in LAYOUTS:
         raise InputError("layout", received=repr(layout), expected="one of " + ", ".join(LAYOUTS))
     given_path(source, expected="a folder or file to import", argument="source")
     given_path(output, expected="a file to write", argument="output")
@@ -149,9 +148,12 @@ def import_data(
     notes = report.notes
     findings: tuple[Finding, ...] = ()
     if report.format == "acquisition":
-        checked = _checked(report.written)
-        findings = tuple(item for item in checked.findings if item.severity != "note")
-        notes = (*notes, *(line for line in _missing(report.written) if line not in notes))
+        from ..acquisition import open_acquisition
+        from ..calibration.check import check_acquisition
+
+        findings = tuple(item for item in check_acquisition(report.written).findings if item.severity != "note")
+        with open_acquisition(report.written) as acquisition:
+            notes = (*notes, *(line for line in acquisition.missing if line not in notes))
     return Imported(
         written=Path(report.written),
         format=report.format,
@@ -167,12 +169,16 @@ def import_data(
 
 def _words(layout: str, words: Mapping[str, Any]) -> dict[str, Any]:
     """A layout's own words as its function calls them, settings read and numbers checked."""
-    names = _WORDS.get(layout, ())
+    names = WORDS.get(layout, ())
     given: dict[str, Any] = {}
     for name, value in words.items():
         if name not in names:
             known = "one of " + ", ".join(names) if names else "no further words"
             raise InputError(name, received=f"a word of layout {layout}", expected=known)
+        if name == "sidecar" and value is not None:
+            given_path(value, expected="a sidecar", argument=name)
+        if name in ("ring_px", "validation", "test") and value is not None:
+            check_number(name, value)
         if name in _ABOVE_ZERO and value is not None:
             unit = _ABOVE_ZERO[name]
             check_number(name, value, unit=unit)
@@ -186,20 +192,6 @@ def _setting(value: Any) -> Any:
     from ..generator.predictions.predict_settings import as_setting
 
     return None if value is None else as_setting(value)
-
-
-def _checked(path: str) -> "CheckResult":
-    from ..calibration.check import check_acquisition
-
-    return check_acquisition(path)
-
-
-def _missing(path: str) -> tuple[str, ...]:
-    """What the new file does not state, and what that keeps from being done."""
-    from ..acquisition import open_acquisition
-
-    with open_acquisition(path) as acquisition:
-        return tuple(acquisition.missing)
 
 
 def _says(key: str, value: Any) -> bool:

@@ -17,8 +17,7 @@ import importlib
 from typing import Any
 
 from ..api._progress import Bar
-from ..api.imports import LAYOUTS, import_data
-from ..errors import InputError
+from ..api.imports import LAYOUTS, WORDS, import_data
 from ..results import counted
 from ._answer import answer, say
 from ._twin_file import HELP
@@ -56,7 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             layout.add_argument("--exposure-ms", type=float, metavar="T", help="exposure of a projection (ms)")
         if name == "zenodo":
             layout.add_argument("--select", metavar="TEXT", help="only folders whose path holds this text")
-            layout.add_argument("--kv", type=float, metavar="KV", help="tube voltage of calibration flats (kV)")
+            layout.add_argument(
+                "--kv", dest="kV", type=float, metavar="KV", help="tube voltage of calibration flats (kV)"
+            )
             layout.add_argument("--exposure-ms", type=float, metavar="T", help="exposure of calibration flats (ms)")
         if name == "reference":
             layout.add_argument("--low", metavar="SETTING", help="low-kV setting, where there are several")
@@ -91,28 +92,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _words(arguments: argparse.Namespace) -> dict[str, Any]:
     """The options of a layout as `rt.import_data` calls them."""
-    if arguments.layout == "images":
-        return {"sidecar": arguments.sidecar}
-    if arguments.layout == "nxtomo":
-        return {"detector": arguments.detector}
-    if arguments.layout == "xtekct":
-        return {"exposure_ms": _positive(arguments.exposure_ms, "--exposure-ms", "ms")}
-    if arguments.layout == "zenodo":
-        return {
-            "select": arguments.select,
-            "kV": _positive(arguments.kv, "--kv", "kV"),
-            "exposure_ms": _positive(arguments.exposure_ms, "--exposure-ms", "ms"),
-        }
-    if arguments.layout == "reference":
-        names = ("sidecar", "low", "high", "each_frame", "ring_px", "validation", "test", "seed", "twin")
-        return {name: getattr(arguments, name) for name in names}
-    return {}
-
-
-def _positive(value: float | None, name: str, unit: str) -> float | None:
-    if value is not None and not 0 < value < float("inf"):
-        raise InputError(name, received=f"{value} {unit}", expected=f"a finite value above 0 {unit}")
-    return value
+    names = (*WORDS.get(arguments.layout, ()), *(("seed", "twin") if arguments.layout == "reference" else ()))
+    return {name: getattr(arguments, name) for name in names}
 
 
 def _text(result: dict[str, Any]) -> str:

@@ -52,6 +52,13 @@ def problem(curves, *, factors=None, noise=1.0):
     )
 
 
+def open_problem(curves, *, let_in=None):
+    """A problem whose forward model can be asked again for what an effect lets in by chance."""
+    own = problem(curves)
+    whole = Problem(**{item.name: getattr(own, item.name, None) for item in fields(Problem)})
+    return replace(whole, again=SimpleNamespace(let_in=lambda _: let_in))
+
+
 def test_effects_at_right_angles_lie_as_far_apart_as_from_nothing_and_parallel_ones_not_at_all():
     found = distinguishability(
         problem(
@@ -370,12 +377,10 @@ def test_a_refined_variant_keeps_what_its_own_onset_does_by_chance():
     """Lost bits that came after the calibration lower later levels; those that were always there do not."""
     always = curve("quantisation", axis(0))
     later = replace(curve("quantisation", axis(0), since="calibration"), spread=axis(1)[:, None])
-    of_session = problem([always, later])
+    whole = open_problem([always, later])
     variant = next(
         item for item in catalogue_variants() if item.effect == "quantisation" and item.since == "calibration"
     )
-    names = [item.name for item in fields(Problem)]
-    whole = Problem(**{name: getattr(of_session, name, None) for name in names})
     found = whole.with_variants([(variant, np.stack([axis(0)] * len(variant.strengths)))]).curves[-1]
     assert found.variant.since == "calibration"
     np.testing.assert_array_equal(found.spread, later.spread)
@@ -388,14 +393,21 @@ def test_a_refined_variant_keeps_what_the_one_it_came_from_does_by_chance():
         Curve(variant=item, responses=axis(0)[None, :], spread=axis(number)[:, None])
         for number, item in enumerate(turned)
     ]
-    of_session = problem(own)
-    names = [item.name for item in fields(Problem)]
-    whole = Problem(**{name: getattr(of_session, name, None) for name in names})
+    whole = open_problem(own)
     for start, like in zip(turned, own, strict=True):
         refined = start.refined({**start.parameters, "curvature": 0.31}, (3.0, 4.0))
         assert refined.name.endswith(f"refined from {start.name}") and refined.strengths == (3.0, 4.0)
         found = whole.with_variants([(refined, np.stack([axis(0)] * 2))]).curves[-1]
         np.testing.assert_array_equal(found.spread, like.spread)
+
+
+def test_a_refined_variant_lets_in_what_its_own_strengths_do():
+    glare = next(item for item in catalogue_variants() if item.effect == "veiling_glare")
+    whole = open_problem(
+        [Curve(variant=glare, responses=axis(0)[None, :], spread=axis(1)[:, None])], let_in=axis(2)[:, None]
+    )
+    found = whole.with_variants([(glare, np.stack([axis(0)] * len(glare.strengths)))]).curves[-1]
+    np.testing.assert_array_equal(found.spread, axis(2)[:, None])
 
 
 @pytest.mark.parametrize("effect", sorted(EFFECTS))

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from ..errors import FitError, InputError
 from .hit_miss import Z_ONE_SIDED, Z_TWO_SIDED, fit_pooled, size_from_x, size_in_range
+from .likelihood import Curve
 from .links import Link, link_from_name
-from .trials import Trials, group_by_size
+from .trials import Trials
 
 Array = NDArray[np.float64]
 
@@ -39,7 +40,8 @@ class Share:
 class LapseFit:
     """A POD curve with ceiling and floor. Sizes in the data's unit, None where the data cannot support a number.
 
-    a90_95: one-sided 95 % likelihood-ratio bound. p_plain: p-value of the test that the plain curve (0 to 1) is enough.
+    a90_95: one-sided 95 % likelihood-ratio bound; a90_low_two_sided, a90_95_two_sided: ends of the two-sided one.
+    p_plain: p-value of the test that the plain curve (0 to 1) is enough.
     """
 
     link: str
@@ -55,6 +57,7 @@ class LapseFit:
     a90: float | None
     a90_95: float | None
     a90_95_two_sided: float | None
+    a90_low_two_sided: float | None
     warnings: tuple[str, ...]
 
 
@@ -76,13 +79,11 @@ def fit_lapse_pod(
     if not (ceiling or floor):
         raise InputError("ceiling and floor", received="neither free", expected="at least one of them free")
     shape = link_from_name(link)
-    plain = fit_pooled(table, link=shape, log_size=log_size, method="auto")
-    if plain.curve is None:
-        raise FitError("; ".join(plain.warnings))
-    rows = np.log(table.size) if log_size else table.size
-    x, hits, misses = group_by_size(rows, table.hits, table.misses)
-    problem = _Problem(x=x, hits=hits, misses=misses, link=shape, ceiling=ceiling, floor=floor)
-    best, value = problem.minimise(None, starts=problem.starts(plain.curve.coefficients))
+    plain_fit = fit_pooled(table, link=shape, log_size=log_size, method="auto")
+    if plain_fit.curve is None:
+        raise FitError("; ".join(plain_fit.warnings))
+    problem, plain = _Problem.of(plain_fit.curve, ceiling=ceiling, floor=floor), plain_fit.curve.coefficients
+    best, value = problem.minimise(None, starts=problem.starts(plain))
     c0, slope, low_share, high_share = problem.parameters(best)
     notes: list[str] = []
 
@@ -104,7 +105,7 @@ def fit_lapse_pod(
     bottom = interval(2, low_share) if floor else Share(value=0.0, low=0.0, high=0.0)
     if ceiling and top.low <= 0.5 + 1e-6:
         notes.append("the trials of large objects are too few to bound the ceiling from below")
-    a50 = a90 = bound = bound_two = None
+    a50 = a90 = bound = bound_two = bound_low = None
     if slope <= 0:
         notes.append("POD does not rise with size in these data: no a50 and no a90")
     else:
@@ -118,14 +119,14 @@ def fit_lapse_pod(
                 continue
             at = (shape.eta_from_pod(share) - c0) / slope
             sizes[percent], note = size_in_range(
-                at, smallest=float(x[0]), largest=float(x[-1]), log_size=log_size, percent=percent
+                at, smallest=float(problem.x[0]), largest=float(problem.x[-1]), log_size=log_size, percent=percent
             )
             if note:
                 notes.append(note)
         a50, a90 = sizes[50], sizes[90]
         if a90 is not None:
             at90 = math.log(a90) if log_size else a90
-            span = float(x[-1] - x[0])
+            span = float(problem.x[-1] - problem.x[0])
             # a curve that never reaches 90 % is one with its a90 at infinity
             never = problem.minimise({3: 0.9}, starts=[best])[1] - value if ceiling else math.inf
 
@@ -137,10 +138,11 @@ def fit_lapse_pod(
                 far = at90 + 20 * span
                 held = never > quantile and drop90(far) > quantile
                 ends.append(_root(drop90, at90, far, quantile) if held else None)
-            bound, bound_two = (size_from_x(end, log_size=log_size) for end in ends)
+            ends.append(_root(drop90, at90, at90 - 20 * span, Z_TWO_SIDED**2))
+            bound, bound_two, bound_low = (size_from_x(end, log_size=log_size) for end in ends)
             if bound is None:
                 notes.append("a curve that never reaches 90 % is within the 95 % likelihood region: no bound on a90")
-    gain = max(problem.deviance(np.array([*plain.curve.coefficients, 0.0, 1.0]))[0] - value, 0.0)
+    gain = max(problem.deviance(np.array([*plain, 0.0, 1.0]))[0] - value, 0.0)
     return LapseFit(
         link=link,
         log_size=log_size,
@@ -149,14 +151,26 @@ def fit_lapse_pod(
         ceiling=top,
         floor=bottom,
         log_likelihood=-0.5 * value,
-        aic=value + 2 * (2 + ceiling + floor),
+        aic=problem.aic(value),
         p_plain=_border_p(gain, ceiling + floor),
         a50=a50,
         a90=a90,
         a90_95=bound,
         a90_95_two_sided=bound_two,
+        a90_low_two_sided=bound_low,
         warnings=tuple(notes),
     )
+
+
+def lapse_aic(plain: Curve, *, ceiling: bool, floor: bool) -> float:
+    """AIC of a curve whose ceiling or floor is free, as in `fit_lapse_pod`, from the most likely one without."""
+    problem = _Problem.of(plain, ceiling=ceiling, floor=floor)
+    starts = problem.starts(plain.coefficients)
+    value, slopes = problem.deviance(starts[-1])
+    # at the border the plain curve is the best one, unless a lower ceiling or a higher floor lowers -2 ln L
+    if (ceiling and slopes[3] > 0) or (floor and slopes[2] < 0):
+        value = min(value, problem.minimise(None, starts=[starts[0], starts[-1]])[1])
+    return problem.aic(value)
 
 
 def _border_p(gain: float, free: int) -> float:
@@ -189,6 +203,11 @@ class _Problem:
     ceiling: bool
     floor: bool
 
+    @classmethod
+    def of(cls, plain: Curve, *, ceiling: bool, floor: bool) -> "_Problem":
+        """Of the trials that a plain curve was fitted to, with its link."""
+        return cls(x=plain.x, hits=plain.hits, misses=plain.misses, link=plain.link, ceiling=ceiling, floor=floor)
+
     def deviance(self, p: Array) -> tuple[float, Array]:
         c0, c1, low, high = p
         eta = c0 + c1 * self.x
@@ -200,7 +219,11 @@ class _Problem:
         by_eta = rate * (high - low) * inner * parts.log_hit_1
         return value, np.array([by_eta.sum(), by_eta @ self.x, rate @ (1 - inner), rate @ inner])
 
-    def starts(self, coefficients: tuple[float, float]) -> list[Array]:
+    def aic(self, value: float) -> float:
+        """Of a curve with this -2 ln L."""
+        return value + 2 * (2 + self.ceiling + self.floor)
+
+    def starts(self, coefficients: tuple[float, ...]) -> list[Array]:
         c0, c1 = coefficients
         middle = float(np.average(self.x, weights=self.hits + self.misses))
         result = []

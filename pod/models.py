@@ -1,4 +1,7 @@
-"""Model choice, shown: every link on size and on log size, by deviance, AIC and goodness of fit."""
+"""Model choice, shown: every link on size and on log size, by deviance, AIC and goodness of fit.
+
+A curve that ends below 1, or begins above 0, joins them where it fits better than the same link from 0 to 1.
+"""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -7,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FitError
-from .hit_miss import Bounds, PodFit, fit_pooled, trusted_bound
+from .hit_miss import NO_BOUNDS, Bounds, PodFit, fit_pooled, trusted_bound
+from .lapse import fit_lapse_pod, lapse_aic
+from .likelihood import Curve
 from .links import LINKS, Link
 from .solver import fit_batch
 from .trials import Trials
@@ -20,6 +25,8 @@ _ALIKE = 2.0  # in AIC: substantial support (Burnham & Anderson 2002, 2.6)
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Alternative:
     """One link and scale on the same trials. deviance, aic: smaller fits better; a90 in the data's unit or None.
+
+    ceiling, floor: where the curve ends and begins, as fitted; None: at 1 and at 0.
 
     a90_95, a90_low, a90_high: its one-sided 95 % bound and the ends of its two-sided 95 % interval, None as in `PodFit`.
 
@@ -37,14 +44,31 @@ class Alternative:
     a90_95: float | None = None
     a90_low: float | None = None
     a90_high: float | None = None
+    ceiling: float | None = None
+    floor: float | None = None
+
+    @property
+    def from_0_to_1(self) -> bool:
+        """Whether it has neither ceiling nor floor."""
+        return self.ceiling is self.floor is None
+
+    @property
+    def name(self) -> str:
+        """The curve in words: scale, link, ceiling or floor."""
+        ends = [
+            f"{word} {value:.3g}"
+            for word, value in (("ceiling", self.ceiling), ("floor", self.floor))
+            if value is not None
+        ]
+        return " ".join([*(["ln"] if self.log_size else []), self.link, *ends])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OverLinks:
     """What the links and scales say together that fit as well as the best one, and the one that was chosen.
 
-    Fields: curves (their names, `ln` before those on log size); a90_lowest, a90_highest; a90_95, a90_low, a90_high: the
-    farthest of their bounds. None where one of them gives none.
+    Fields: curves (their names, `ln` before those on log size, a ceiling or floor after); a90_lowest, a90_highest;
+    a90_95, a90_low, a90_high: the farthest of their bounds. None where one of them gives none.
     """
 
     curves: tuple[str, ...]
@@ -65,18 +89,15 @@ def over_links(found: tuple[Alternative, ...], *, link: str, log_size: bool) -> 
     if not known:
         return None
     best = min(one.aic for one in known if one.aic is not None)
-    alike = [
-        one
-        for one in known
-        if (one.aic is not None and one.aic <= best + _ALIKE) or (one.link, one.log_size) == (link, log_size)
-    ]
+    chosen = ("ln " if log_size else "") + link
+    alike = [one for one in known if (one.aic is not None and one.aic <= best + _ALIKE) or one.name == chosen]
 
     def farthest(pick: Callable[[list[float]], float], name: str) -> float | None:
         values = [getattr(one, name) for one in alike]
         return None if None in values else pick(values)
 
     return OverLinks(
-        curves=tuple(("ln " if one.log_size else "") + one.link for one in alike),
+        curves=tuple(one.name for one in alike),
         a90_lowest=farthest(min, "a90"),
         a90_highest=farthest(max, "a90"),
         a90_95=farthest(max, "a90_95"),
@@ -93,8 +114,14 @@ def better_curve(found: tuple[Alternative, ...], fit: PodFit) -> Alternative | N
     return best if fit.aic > best.aic + _ALIKE else None
 
 
-def widened(fit: PodFit, joined: OverLinks) -> PodFit:
-    """A fit whose bounds on a90 reach as far as those of all links and scales together; None where one of these has none."""
+def widened(fit: PodFit, joined: OverLinks, best: Alternative) -> PodFit:
+    """A fit whose bounds on a90 reach as far as those of all curves together; None where one of these has none.
+
+    best: the curve that fits better than this one. Where it ends below 90 %, there is no a90.
+    """
+    if best.a90 is None and best.ceiling is not None and best.ceiling <= 0.9:
+        without = replace(fit, a90=None, reaches_90=False)
+        return replace(without, a90_95=NO_BOUNDS, a90_95_two_sided=NO_BOUNDS, a90_low_two_sided=NO_BOUNDS)
 
     def farther(bounds: Bounds, end: float | None, pick: Callable[..., float]) -> Bounds:
         own = {name: value for name, value in asdict(bounds).items() if value is not None}
@@ -109,13 +136,14 @@ def widened(fit: PodFit, joined: OverLinks) -> PodFit:
 
 
 def compare_models(table: Trials, *, log_sizes: tuple[bool, ...] | None = None) -> tuple[Alternative, ...]:
-    """All links on size and, where every size is above 0, on log size; best AIC first.
+    """All links on size and, where every size is above 0, on log size, and what they fit with a ceiling or floor; best AIC first.
 
     The trials are taken as independent: with repeats the differences of deviance are too large, their order stands.
     Source: Pregibon, Appl. Stat. 29 (1980) 15; Hosmer & Lemeshow, Commun. Stat. A 9 (1980) 1043.
     """
     scales = log_sizes if log_sizes is not None else ((False, True) if np.all(table.size > 0) else (False,))
-    found = []
+    found: list[Alternative] = []
+    curves: list[tuple[Alternative, Curve]] = []
     for name, link in LINKS.items():
         for log_size in scales:
             try:
@@ -137,7 +165,45 @@ def compare_models(table: Trials, *, log_sizes: tuple[bool, ...] | None = None) 
                     a90_high=trusted_bound(fit.a90_95_two_sided, separated=fit.separated),
                 )
             )
+            if fit.curve is not None:
+                curves.append((found[-1], fit.curve))
+    found += _with_ends(table, curves)
     return tuple(sorted(found, key=lambda one: np.inf if one.aic is None else one.aic))
+
+
+def _with_ends(table: Trials, plain: list[tuple[Alternative, Curve]]) -> list[Alternative]:
+    """Curves with a ceiling or a floor that fit better than the same link without, and about as well as the best of all."""
+    known = [(one, curve, one.aic) for one, curve in plain if one.aic is not None]
+    tried = []
+    for one, curve, own in known:
+        for end in ("ceiling", "floor"):
+            aic = lapse_aic(curve, ceiling=end == "ceiling", floor=end == "floor")
+            if aic < own:
+                tried.append((aic, aic - own, one, end))
+    best = min([aic for aic, *_ in tried] + [own for *_, own in known], default=np.inf)
+    found = []
+    for aic, gain, one, end in tried:
+        if aic > best + _ALIKE:
+            continue
+        top, bottom = end == "ceiling", end == "floor"
+        fit = fit_lapse_pod(table, link=one.link, log_size=one.log_size, ceiling=top, floor=bottom)
+        found.append(
+            Alternative(
+                link=one.link,
+                log_size=one.log_size,
+                deviance=None if one.deviance is None else one.deviance + gain - 2.0,
+                aic=aic,
+                a90=fit.a90,
+                p_link=None,
+                p_fit=None,
+                a90_95=fit.a90_95,
+                a90_low=fit.a90_low_two_sided,
+                a90_high=fit.a90_95_two_sided,
+                ceiling=fit.ceiling.value if top else None,
+                floor=fit.floor.value if bottom else None,
+            )
+        )
+    return found
 
 
 def goodness_of_fit(fit: PodFit, *, link: Link) -> tuple[float | None, float | None]:

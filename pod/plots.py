@@ -91,7 +91,7 @@ def plot_models(alternatives: Sequence[Alternative]) -> "Figure":
     if not shown:
         raise FitError("no link fits these data: nothing to compare")
     figure, axes = _figure(5.6, 0.35 * len(shown) + 1.2)
-    names = [one.link + (" on ln size" if one.log_size else "") for one in shown]
+    names = [one.name for one in shown]
     best = min(one.aic for one in shown if one.aic is not None)
     axes.barh(names[::-1], [(one.aic or 0.0) - best for one in shown][::-1], color=_BLUE, height=0.6)
     for place, one in enumerate(shown[::-1]):

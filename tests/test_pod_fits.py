@@ -254,7 +254,7 @@ def test_bounds_of_a_curve_that_fits_worse_reach_as_far_as_those_of_curves_that_
     assert better_curve(found, fit) is found[0]
     assert better_curve(found, fit_pod(size, hit, link="logit", log_size=True)) is None
     joined = over_links(found, link="cloglog", log_size=False)
-    wide = widened(fit, joined)
+    wide = widened(fit, joined, found[0])
     true = 2.0 * 9.0**0.2
     assert not fit.a90_low_two_sided.modified <= true <= fit.a90_95_two_sided.modified
     assert wide.a90_low_two_sided.modified <= true <= wide.a90_95_two_sided.modified
@@ -265,6 +265,31 @@ def test_bounds_of_a_curve_that_fits_worse_reach_as_far_as_those_of_curves_that_
     named = rt.fit_pod({"size": size, "hit": hit}, size="size", hit="hit", link="cloglog")
     assert named.fit == fit
     assert any("another curve fits better" in text for text in named.warnings)
+
+
+@pytest.mark.parametrize(("top", "reaches"), [(0.97, True), (0.82, False)])
+def test_a_curve_that_ends_below_1_is_among_those_that_are_tried_and_below_90_percent_there_is_no_a90(top, reaches):
+    rng = np.random.default_rng(8)
+    size = rng.uniform(0.3, 4.5, 600)
+    hit = rng.random(600) < top / (1.0 + np.exp(-4.0 * (size - 2.0)))
+    best = compare_models(check_trials(size, hit))[0]
+    assert best.ceiling == pytest.approx(top, abs=0.05)
+    answer = rt.fit_pod({"size": size, "hit": hit}, size="size", hit="hit")
+    assert any(f"ceiling {best.ceiling:.3g}" in text for text in answer.warnings)
+    if reaches:
+        true = 2.0 + np.log(0.9 / (top - 0.9)) / 4.0
+        assert answer.fit.a90_low_two_sided.modified <= true <= answer.fit.a90_95_two_sided.modified
+    else:
+        assert (answer.a90, answer.to_dict()["a90_95"]["modified"], answer.fit.reaches_90) == (None, None, False)
+        assert fit_pod(size, hit, link="cloglog").a90 is not None
+
+
+def test_a_ceiling_or_a_floor_is_tried_where_it_fits_better_than_the_same_link_without():
+    size, hit = drawn(4, n=80)
+    found = compare_models(check_trials(size, hit))
+    plain = {(one.link, one.log_size): one.aic for one in found if one.from_0_to_1}
+    assert len(plain) == 8
+    assert all(one.aic < plain[one.link, one.log_size] for one in found if not one.from_0_to_1)
 
 
 def test_sizes_far_from_0_beside_their_differences_are_told():
@@ -400,11 +425,11 @@ def test_near_separated_data_still_converge():
 def test_models_are_shown_best_first_and_the_true_link_is_not_refuted():
     size, hit = drawn(13, n=4000, link="loglog", c0=-2.0, c1=20.0)
     found = compare_models(check_trials(size, hit))
-    assert len(found) == 8
+    assert sum(one.from_0_to_1 for one in found) == 8
     assert [one.aic for one in found] == sorted(one.aic for one in found)
-    by_name = {(one.link, one.log_size): one for one in found}
-    assert by_name["loglog", False].p_link > 1e-3
-    assert by_name["cloglog", False].p_link < 1e-3
+    by_name = {one.name: one for one in found}
+    assert by_name["loglog"].p_link > 1e-3
+    assert by_name["cloglog"].p_link < 1e-3
 
 
 @pytest.mark.slow
@@ -413,7 +438,7 @@ def test_goodness_of_fit_is_even_under_the_true_model():
     values = []
     for seed in range(60):
         size, hit = drawn(100 + seed, n=200)
-        one = next(m for m in compare_models(check_trials(size, hit), log_sizes=(False,)) if m.link == "cloglog")
+        one = next(m for m in compare_models(check_trials(size, hit), log_sizes=(False,)) if m.name == "cloglog")
         values.append(one.p_link)
     assert abs(np.mean(values) - 0.5) < 4 * 0.289 / math.sqrt(60)
 

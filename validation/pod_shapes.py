@@ -83,7 +83,8 @@ def of_shapes(simulations: int, trials: int) -> None:
                 given.append(bounds_of(fit))
                 continue
             joined.append((found.a90_95, found.a90_low, found.a90_high))
-            given.append(bounds_of(widened(fit, found) if better_curve(alternatives, fit) else fit))
+            best = better_curve(alternatives, fit)
+            given.append(bounds_of(fit if best is None else widened(fit, found, best)))
         text = f"n {trials} {name:20} one link {shares(one, true)}; as given {shares(given, true)}"
         print(f"{text}; over links {shares(joined, true)}", flush=True)
 

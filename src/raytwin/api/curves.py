@@ -525,7 +525,7 @@ def _hit_curve(
         if best is not None and joined is not None:
             warnings.append(_better_told(fit, best, widened=link is None))
             if link is None:
-                fit = widened(fit, joined)
+                fit = widened(fit, joined, best)
     asked: dict[str, Callable[[], Any]] = {}
     if ceiling or floor:
         asked["lapse"] = lambda: _lapse(trials, fit, ceiling=ceiling, floor=floor, warnings=warnings)
@@ -547,16 +547,12 @@ def _hit_curve(
 
 
 def _better_told(fit: "PodFit", best: "Alternative", *, widened: bool) -> str:
-    """A warning that another link or scale fits far better; widened: bounds are those of all that fit."""
+    """A warning that another curve fits far better; widened: bounds are those of all that fit."""
     told = "none" if best.a90 is None else f"{best.a90:.4g}"
     bounds = (
         "bounds are those of all curves that fit" if widened else "bounds of all curves that fit stand in over_links"
     )
-    return (
-        f"another curve fits better: {best.link} on {'ln ' if best.log_size else ''}size (AIC lower by"
-        f" {(fit.aic or 0.0) - (best.aic or 0.0):.3g}, a90 {told}); {bounds}; try a ceiling or floor where large objects are missed"
-        " or small ones hit"
-    )
+    return f"another curve fits better: {best.name} (AIC lower by {(fit.aic or 0.0) - (best.aic or 0.0):.3g}, a90 {told}); {bounds}"
 
 
 @contextmanager

@@ -66,13 +66,18 @@ def text_from_answer(result: dict[str, Any], size_name: str) -> str:
         )
     if result.get("alternatives"):
         lines.append("other links and scales" + (", looks taken as independent:" if "naive" in result else ":"))
-        lines.append(f"{'link':<9}{'size':>5}{'deviance':>11}{'AIC':>10}{'a90':>10}{'p(link)':>11}{'p(fit)':>11}")
+        lines.append(f"{'link':<22}{'size':>5}{'deviance':>11}{'AIC':>10}{'a90':>10}{'p(link)':>11}{'p(fit)':>11}")
         for one in result["alternatives"]:
             lines.append(
-                f"{one['link']:<9}{'ln' if one['log_size'] else '':>5}{shown(one['deviance']):>11}{shown(one['aic']):>10}"
+                f"{_with_end(one):<22}{'ln' if one['log_size'] else '':>5}{shown(one['deviance']):>11}{shown(one['aic']):>10}"
                 f"{shown(one['a90']):>10}{_p(one['p_link']):>11}{_p(one['p_fit']):>11}"
             )
     return "\n".join(lines)
+
+
+def _with_end(one: dict[str, Any]) -> str:
+    ends = [f" {name} {one[name]:.3g}" for name in ("ceiling", "floor") if one[name] is not None]
+    return "".join([one["link"], *ends])
 
 
 def _p(value: float | None) -> str:

@@ -211,6 +211,16 @@ class _Normal:
             # the one that would be most negative in its own standard deviations goes first
             free[min(negative, key=lambda place: found[place] * math.sqrt(self.matrix[place, place]))] = False
 
+    def with_white_prior(self, gains: FloatArray) -> "_Normal":
+        """With the prior of the white parts, relative to gains (group,)."""
+        matrix = self.matrix.copy()
+        centre, width = WHITE_FRACTION_PRIOR
+        for group, gain in enumerate(gains):
+            row = np.array([-centre, 1.0]) / (max(abs(float(gain)), 1e-12) * width)
+            both = [group, len(gains) + group]
+            matrix[np.ix_(both, both)] += np.outer(row, row)
+        return replace(self, matrix=matrix)
+
     def covariance(self) -> FloatArray:
         """Inverse of the matrix."""
         scale = np.sqrt(np.clip(np.diag(self.matrix), 1e-300, None))
@@ -225,6 +235,23 @@ def _most_of_power(measured: FloatArray, modes: FloatArray, cells: int) -> Float
     farthest = math.sqrt(2.0 * math.log(max(cells, 2)))
     root = 1.0 - 1.0 / (9.0 * modes) - farthest / (3.0 * np.sqrt(modes))
     return np.where(root > 0, measured / np.maximum(root, 1e-3) ** 3, math.inf)
+
+
+@dataclass(frozen=True, slots=True)
+class _SlowSums:
+    """What a series adds to the normal equations of its slow changes (change,), whatever the spread is."""
+
+    weighted: FloatArray  # their power times the weights (cell, change)
+    squares: FloatArray  # (change, change)
+    with_read: FloatArray
+    with_data: FloatArray
+
+    @classmethod
+    def of(cls, side: int, weights: FloatArray, data: FloatArray, read: FloatArray) -> "_SlowSums":
+        """Of a series with these weights, powers and electronic noise (cell,)."""
+        slow = _slow_in_cells(side)
+        weighted = slow * weights[:, None]
+        return cls(weighted, slow.T @ weighted, weighted.T @ read, weighted.T @ data)
 
 
 class _Problem:
@@ -293,6 +320,10 @@ class _Problem:
             key = (item.square_px, group)
             self.sums[key] = self.sums[key] + rows if key in self.sums else rows
             self.square += float(np.sum(weight * data**2))
+        self.slow = [
+            _SlowSums.of(item.square_px, weight, data, self.read_in_cells(item.square_px))
+            for item, data, weight in zip(self.series, self.data, self.weights, strict=True)
+        ]
 
     def read_in_cells(self, side: int) -> FloatArray:
         """Power of a unit of electronic noise (cell,)."""
@@ -309,17 +340,17 @@ class _Problem:
     def normal(
         self,
         shapes: Mapping[int, FloatArray],
-        gains: FloatArray | None,
         quantum: FloatArray | None = None,
         slopes: Sequence[Mapping[int, FloatArray]] = (),
     ) -> _Normal:
         """Normal equations of A_0.., W_0.., r^2, E and F of each drifting series, and of the spread's parameters.
 
+        The white parts have no prior here.
+
         Without repeated darks the electronic noise has the prior of a standard deviation that is uniform up to its bound.
 
         Args:
             shapes: power of unit quanta (cell,) by side.
-            gains: (group,) that the white part's prior is relative to; None: no prior.
             quantum: A (group,), for the spread's parameters.
             slopes: derivatives of the shapes by these.
         """
@@ -348,26 +379,17 @@ class _Problem:
             matrix[read, places] += cross
             right[places] += columns.T @ single_data
         for order, number in enumerate(self.drifting):
-            item, group = self.series[number], self.group[number]
+            item, group, slow = self.series[number], self.group[number], self.slow[number]
             own = [drift + 2 * order, drift + 2 * order + 1]
-            slow = _cells(item.square_px)[0] @ _slow(item.square_px)[:, usable(item.square_px)].T
-            weighted = slow * self.weights[number][:, None]
             places, columns = basis(item.square_px, group)
-            matrix[np.ix_(own, own)] += slow.T @ weighted
-            cross = item.signal_DN * (columns.T @ weighted)
+            matrix[np.ix_(own, own)] += slow.squares
+            cross = item.signal_DN * (columns.T @ slow.weighted)
             matrix[np.ix_(places, own)] += cross
             matrix[np.ix_(own, places)] += cross.T
-            of_read = weighted.T @ self.read_in_cells(item.square_px)
-            matrix[own, read] += of_read
-            matrix[read, own] += of_read
-            right[own] += weighted.T @ self.data[number]
+            matrix[own, read] += slow.with_read
+            matrix[read, own] += slow.with_read
+            right[own] += slow.with_data
             matrix[own, own] += 1.0 / self.slow_sd_DN2[number] ** 2
-        if gains is not None:
-            centre, width = WHITE_FRACTION_PRIOR
-            for group, gain in enumerate(gains):
-                row = np.array([-centre, 1.0]) / (max(abs(float(gain)), 1e-12) * width)
-                both = [group, groups + group]
-                matrix[np.ix_(both, both)] += np.outer(row, row)
         square = self.square
         if self.most_read_DN2 <= 0:
             matrix[read, read] += 1e9 * max(matrix[read, read], 1e-300)  # declared to be 0
@@ -384,10 +406,10 @@ class _Problem:
 
         `also`: further coefficients that are not negative.
         """
-        shapes, least_0 = self.in_cells(spread), (*self.not_negative, *also)
-        first = self.normal(shapes, None).solved(least_0)[0]
+        normal, least_0 = self.normal(self.in_cells(spread)), (*self.not_negative, *also)
         # the sum is the gain, known even where the two cannot be told apart
-        return self.normal(shapes, self.gains(first)).solved(least_0)
+        gains = self.gains(normal.solved(least_0)[0])
+        return normal.with_white_prior(gains).solved(least_0)
 
     @property
     def not_negative(self) -> range:
@@ -451,7 +473,7 @@ class _Problem:
                 )
             if number in self.drifting:
                 place = read + 1 + 2 * self.drifting.index(number)
-                slow = _cells(item.square_px)[0] @ _slow(item.square_px)[:, usable(item.square_px)].T
+                slow = _slow_in_cells(item.square_px)
                 # a pair's own coefficients follow its noise, and weights that do so favour what came out low
                 known = np.isfinite(self.slow_sd_DN2[number])
                 power += slow @ (
@@ -487,6 +509,12 @@ def electronic_shape(darks: Sequence[NoisePower], side: int) -> FloatArray:
 
 
 @lru_cache(maxsize=16)
+def _slow_in_cells(side: int) -> FloatArray:
+    """The power of slow changes (cell, change)."""
+    return np.asarray(_cells(side)[0] @ _slow(side)[:, usable(side)].T)
+
+
+@lru_cache(maxsize=16)
 def _slow(side: int) -> FloatArray:
     """f_0 / f and its square (2, K + 1, K + 1), 1 at the lowest frequency in full use: spectra of most slow processes lie between."""
     order = np.arange(side // 2 + 1)
@@ -516,11 +544,8 @@ def _fitted(problem: _Problem, family: str, starts: Sequence[FloatArray], *, fix
     spread = FAMILIES[family].spread(theta)
     coefficients, _ = problem.solve(spread)
     normal = problem.normal(
-        problem.in_cells(spread),
-        problem.gains(coefficients),
-        coefficients[: problem.groups],
-        _slopes(problem, family, theta, free),
-    )
+        problem.in_cells(spread), coefficients[: problem.groups], _slopes(problem, family, theta, free)
+    ).with_white_prior(problem.gains(coefficients))
     linear = len(coefficients)
     places = [*range(linear), *(linear + place for place in free)]
     covariance = np.zeros((linear + len(names), linear + len(names)))
@@ -589,10 +614,9 @@ def _descended(
     for _ in range(_MOST_STEPS):
         normal = problem.normal(
             problem.in_cells(FAMILIES[family].spread(theta)),
-            problem.gains(coefficients),
             coefficients[: problem.groups],
             _slopes(problem, family, theta, free),
-        )
+        ).with_white_prior(problem.gains(coefficients))
         step = np.zeros(len(theta))
         step[list(free)] = normal.solved(problem.not_negative)[0][-len(free) :]
         for share in (1.0, 0.5, 0.25, 0.1, 0.03):
@@ -627,10 +651,9 @@ def _learn_changes(problem: _Problem, item: _Candidate) -> None:
     coefficients, chi_square = problem.solve(item.spread)
     normal = problem.normal(
         problem.in_cells(item.spread),
-        problem.gains(coefficients),
         coefficients[: problem.groups],
         _slopes(problem, item.family, item.theta, range(len(item.theta))),
-    )
+    ).with_white_prior(problem.gains(coefficients))
     problem.learn_changes(normal, max(1.0, chi_square / problem.independent))
 
 
@@ -963,7 +986,8 @@ def _drifting(problem: _Problem, candidate: _Candidate) -> tuple[int, ...]:
     always = problem.drifting
     problem.drifting = lit
     coefficients, _ = problem.solve(candidate.spread)
-    covariance = problem.normal(problem.in_cells(candidate.spread), problem.gains(coefficients)).covariance()
+    normal = problem.normal(problem.in_cells(candidate.spread)).with_white_prior(problem.gains(coefficients))
+    covariance = normal.covariance()
     problem.drifting = always
     first = 2 * problem.groups + 1
     needed = math.log(max(problem.independent, 2.0))

@@ -25,7 +25,7 @@ of which this is one distance to the pixels and nothing sent back.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -172,18 +172,38 @@ def _noise_power(spread: Spread, cells: int) -> FloatArray:
     power = np.outer(rows, columns)
     if spread.tail_share > 0.0:
         core, tail = 1.0 - spread.tail_share, spread.tail_share
-        order = np.arange(-_ALIASES, _ALIASES + 1) if spread.model == "aperture" else np.zeros(1)
-        every = (np.arange(cells // 2 + 1)[:, None] / cells + order).ravel()
-        gaussians = [base_transfer_1d(spread.model, width, every) for width in widths]
-        square = spread.aspect * every[:, None] ** 2 + every[None, :] ** 2 / spread.aspect
-        light = tail * _tail_transfer(spread, square)
-        light *= 2.0 * core * np.outer(*gaussians) + light
-        if spread.model == "aperture":
-            light *= np.outer(np.sinc(every), np.sinc(every)) ** 2
-        count = (cells // 2 + 1, order.size)
-        power = core**2 * power + light.reshape(*count, *count).sum(axis=(1, 3))
+        # a core of no width and a share of 1: what other cores and shares have in common
+        light, of_tail = _light_of_tail(replace(spread, sigma_px=0.0, tail_share=1.0), cells)
+        along_rows, along_columns = (
+            base_transfer_1d(spread.model, width, _aliases(spread.model, cells)) for width in widths
+        )
+        of_both = _folded(along_rows[:, None] * light * along_columns[None, :], cells)
+        power = core**2 * power + 2.0 * core * tail * of_both + tail**2 * of_tail
     power.flags.writeable = False
     return power
+
+
+@lru_cache(maxsize=8)
+def _light_of_tail(tail: Spread, cells: int) -> tuple[FloatArray, FloatArray]:
+    """Transfer of a tail times what the pixel lets through, at all aliases along both axes, and the power of the tail alone."""
+    every = _aliases(tail.model, cells)
+    transfer = _tail_transfer(tail, tail.aspect * every[:, None] ** 2 + every[None, :] ** 2 / tail.aspect)
+    aperture = np.outer(np.sinc(every), np.sinc(every)) ** 2 if tail.model == "aperture" else np.ones_like(transfer)
+    light = transfer * aperture
+    return light, _folded(light * transfer, cells)
+
+
+@lru_cache(maxsize=16)
+def _aliases(model: str, cells: int) -> FloatArray:
+    """Frequencies that fall on 0 .. 1/2 along one axis, those of one after the other."""
+    order = np.arange(-_ALIASES, _ALIASES + 1) if model == "aperture" else np.zeros(1)
+    return np.asarray((np.arange(cells // 2 + 1)[:, None] / cells + order).ravel())
+
+
+def _folded(power: FloatArray, cells: int) -> FloatArray:
+    """The sum over aliases (cells/2 + 1, cells/2 + 1)."""
+    kept = cells // 2 + 1
+    return np.asarray(power.reshape(kept, len(power) // kept, kept, -1).sum(axis=(1, 3)))
 
 
 def _power_of_gaussian(model: str, sigma_px: float, cells: int) -> FloatArray:

@@ -299,7 +299,7 @@ def _clean_products(alarms: Criterion) -> Measurement:
     count = math.ceil(math.log(1.0 - _ONE_SIDED) / math.log1p(-required))
     while upper_rate(rate, count) > required:
         count = math.ceil(1.1 * count)
-    seen = "without any alarm" if rate == 0 else f"with alarms in {100 * rate:.2g} % of them, as now"
+    seen = "without any alarm" if rate == 0 else f"with alarms in {100 * rate:.3g} % of them, as now"
     return Measurement(
         kind="clean_products", number=count, text=f"{count} different products without objects, {seen}, show the rate"
     )
@@ -354,7 +354,7 @@ def criterion_text(one: Criterion, *, unit: str) -> str:
         return f"{name} unknown"
     shown: Callable[[float], str] = {
         "detection": lambda value: f"{value:.3g} {unit}".rstrip(),
-        "false_alarms": lambda value: f"{100 * value:.2g} %",
+        "false_alarms": lambda value: f"{100 * value:.3g} %",
         "throughput": lambda value: f"{60 * value:.0f} a minute" if value >= 1 else f"{60 * value:.3g} a minute",
         "dose": lambda value: f"{value:.3g} uGy",
     }[one.name]

@@ -407,7 +407,7 @@ def screened_rows(screen: Screen, rows: Mapping[str, dict[str, Any]], asked: Seq
 def _why(decided: Decided, expected: Expected | None, campaign: Campaign) -> str:
     """Why a setting was not trained, in words."""
     chance = 0.0 if decided.chance is None else decided.chance
-    told = f"{100 * chance:.2g} %" if chance >= 0.001 else "less than 0.1 %"
+    told = f"{100 * chance:.3g} %" if chance >= 0.001 else "less than 0.1 %"
     if decided.kind == "worse":
         return f"not trained: a90 is smaller than that of the best with a chance of {told}"
     if decided.kind == "misses":

@@ -118,7 +118,7 @@ def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int
         if float(np.ptp(frames)) == 0.0:
             blank[item.name] = found, float(frames.flat[0])
         elif full > _SATURATED:
-            unusable[item.name] = f"saturated: {100 * full:.2g} % of the pixels stand at {frames.max():.0f} DN"
+            unusable[item.name] = f"saturated: {100 * full:.0f} % of the pixels stand at {frames.max():.0f} DN"
             saturated.add(item.name)
         else:
             readings.append(found)

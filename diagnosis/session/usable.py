@@ -132,7 +132,7 @@ def look_at_all(
         )
         full = looks[item.name].saturated_share
         if full > _MOST_SATURATED and item.series.kind != "dark":
-            left_out[item.name] = f"{item.name}: saturated in {100 * full:.2g} % of the pixels"
+            left_out[item.name] = f"{item.name}: saturated in {100 * full:.3g} % of the pixels"
     return SeenSeries(
         kept=tuple(item for item in items if item.name not in left_out),
         expected=expected,

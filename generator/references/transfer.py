@@ -235,7 +235,7 @@ def check_transfer(
         )
     if worst > _TELL_EXCESS:
         return (
-            f"the references carry some noise that the target would not have: its variance is {100 * worst:.2g} % too high",
+            f"the references carry some noise that the target would not have: its variance is {100 * worst:.3g} % too high",
         )
     return ()
 

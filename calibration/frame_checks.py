@@ -280,16 +280,18 @@ def _change(
     lit: bool,
     noise_growth: float,
 ) -> _Change:
-    """Fit the later frame as the earlier one times a smooth surface, and an offset; blocks that stand out are left out.
+    """Fit the difference of two frames as their mean times a smooth surface, and an offset; blocks that stand out are left out.
+
+    The noise of the mean is independent of the difference's: of the earlier frame alone it would look like a change of shape.
 
     `noise_growth` is how much more noise a mean over many blocks may have than white noise of the blocks' variance has.
     """
     from scipy.special import chdtri  # of chi-square's upper tail
 
-    difference = later - earlier
-    signal = float(np.mean(earlier))
+    difference, middle = later - earlier, 0.5 * (earlier + later)
+    signal = float(np.mean(middle))
     count = len(terms)
-    rows = terms * earlier if lit else terms
+    rows = terms * middle if lit else terms
     design = np.concatenate([rows, terms[:1]]) if lit else rows
     matrix = design.reshape(len(design), -1).T
     target = difference.reshape(-1)
@@ -311,11 +313,11 @@ def _change(
     if lit and signal > 0:
         level = float(np.mean(difference)) / signal
         surface = np.tensordot(solution[:count], terms, 1)
-        smooth = surface * earlier + solution[count]
+        smooth = surface * middle + solution[count]
         # what noise alone gives to the coefficients, so that only more than that is a change
         spread = 1.4826 * float(np.median(np.abs(left))) * noise_growth / math.sqrt(left.size)
         by_noise = spread**2 * float(chdtri(len(design), FALSE_ALARM))
-        shape = math.sqrt(max(float(np.var(smooth - level * earlier)) - by_noise, 0.0)) / signal
+        shape = math.sqrt(max(float(np.var(smooth - level * middle)) - by_noise, 0.0)) / signal
         level = math.copysign(max(abs(level) - _two_sided_limit(FALSE_ALARM) * spread / signal, 0.0), level)
     lines = max(float(np.max(np.abs(np.median(left, axis=axis)))) for axis in (0, 1))
     return _Change(level=level, shape=shape, lines_DN=lines, left=left)

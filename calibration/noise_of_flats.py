@@ -274,7 +274,9 @@ def _pair_power(pair: FlatPair, darks: DarkFrames, good: NDArray[np.bool_], shap
         good=good,
         shape=shape,
     )
-    return replace(found, modes=pair.share * found.modes)
+    averaged = min(first.averaged, second.averaged)
+    stored = replace(found, modes=pair.share * found.modes).times(1.0 / averaged)
+    return stored.as_exposure(averaged, whole=first_sum.integer and second_sum.integer)
 
 
 def _power(
@@ -298,7 +300,7 @@ def _power(
 
     about = (total.mean_DN, total.frames) if estimator == "stack" else None
     found = compute_noise_power(pieces(), signal_DN=signal, good=good, about=about)
-    return found.times(float(item.averaged))
+    return found.as_exposure(item.averaged, whole=total.integer)
 
 
 def _fit(

@@ -70,6 +70,8 @@ def _diagnosed(
     elif session.suspects:
         cleared = (f"{item.text}; what was found makes it look so" for item in session.suspects)
         result = replace(result, notes=(*result.notes, *cleared))
+    if session.stops:
+        result = _cut_off(result, session.stops)
     if session.factor == 1:
         return result
     if twin is None:
@@ -77,6 +79,32 @@ def _diagnosed(
             progress("calibration with all pixels")
         twin = calibrated_twin(session.all_pixels, rng=rng)
     return in_pixels(result, twin=twin, factor=session.factor)
+
+
+def _cut_off(diagnosis: Diagnosis, stops: str) -> Diagnosis:
+    """The diagnosis of a session whose numbers stop early in some series: something is missing, whatever the others say."""
+    none = sum(item.probability for item in diagnosis.hypotheses if not item.effects)
+    hypotheses = [
+        replace(
+            item,
+            probability=item.probability + none
+            if item.effects == (UNKNOWN,)
+            else item.probability * bool(item.effects),
+        )
+        for item in diagnosis.hypotheses
+    ]
+    words = {"no_gap": "unknown_effect", "explained": "explained_in_part"}
+    return replace(
+        diagnosis,
+        verdict=words.get(diagnosis.verdict, diagnosis.verdict),
+        hypotheses=tuple(sorted(hypotheses, key=lambda item: -item.probability)),
+        probability_no_gap=0.0,
+        probability_unknown=diagnosis.probability_unknown + none,
+        unknown_location="level of the saturated series"
+        if diagnosis.verdict == "no_gap"
+        else diagnosis.unknown_location,
+        notes=(stops, *diagnosis.notes),
+    )
 
 
 def _doubted(diagnosis: Diagnosis, twin: Twin, suspects: tuple[Suspect, ...]) -> Diagnosis:

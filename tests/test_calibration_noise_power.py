@@ -10,6 +10,7 @@ from raytwin.calibration.noise_power import (
     compute_difference_power,
     compute_noise_power,
     correlation_of_quanta,
+    rounding_variance,
     smeared,
     spread_of_bins,
     usable,
@@ -229,3 +230,23 @@ def test_copies_of_frames_leave_the_noise_power_alone():
     np.testing.assert_allclose(found.power_DN2, once.power_DN2)
     still = compute_noise_power([np.repeat(frames[:1], 4, axis=0)], signal_DN=LEVEL, good=good)
     assert not np.nan_to_num(still.power_DN2).any()
+
+
+@pytest.mark.parametrize("sd_DN", [0.05, 0.1, 0.25, 0.5, 2.0])
+def test_rounding_adds_a_twelfth_and_less_to_noise_far_below_a_step(sd_DN):
+    rng = np.random.default_rng(12)
+    levels = rng.random((20000, 1))
+    stored = float(np.mean(np.var(np.rint(levels + sd_DN * rng.standard_normal((20000, 60))), axis=1, ddof=1)))
+    assert stored - rounding_variance(stored) == pytest.approx(sd_DN**2, rel=0.02, abs=6e-4)
+
+
+@pytest.mark.parametrize("averaged", [16, 64])
+def test_means_that_were_rounded_give_the_noise_of_one_exposure(averaged):
+    """Rounding comes once a mean: 64 times over it would be read noise of 2.3 DN."""
+    rng = np.random.default_rng(averaged)
+    exact = 400.0 + rng.random((128, 128)) + 2.0 / np.sqrt(averaged) * rng.standard_normal((20, 128, 128))
+    good = np.ones((128, 128), dtype=bool)
+    found = compute_noise_power([np.rint(exact)], signal_DN=np.zeros((128, 128)), good=good)
+    one = found.as_exposure(averaged, whole=True)
+    assert float(np.nanmean(one.power_DN2)) == pytest.approx(4.0, rel=0.02)
+    assert float(np.nanmean(found.as_exposure(averaged, whole=False).power_DN2)) > 4.0 + 0.9 * averaged / 12.0

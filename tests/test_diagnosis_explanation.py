@@ -1,12 +1,15 @@
 """The diagnosis in words: what each verdict must say."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
-from raytwin.diagnosis.judgement.answer import Cause, Place
+from raytwin.diagnosis.diagnose_session import _cut_off
+from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis
+from raytwin.diagnosis.judgement.answer import Cause, Diagnosis, Place
 from raytwin.diagnosis.judgement.held_out import Gap
-from raytwin.diagnosis.report.explanation import location_text, paragraph
+from raytwin.diagnosis.report.explanation import location_text, paragraph, title_of
 
 
 def place(axis, series, z, *, statistic="mean frame", location=""):
@@ -108,10 +111,51 @@ def test_an_explanation_states_strength_interval_probability_and_what_is_left():
     assert "-2.00 % (-2.50 to -1.50)" in paragraph(diagnosis("explained", causes=(lower,), named=("kv_error",)))
 
 
+def test_what_leaves_most_of_the_gap_is_no_explanation():
+    found = cause("row_noise", 0.9, (0.9, 0.7, 1.2))
+    wider = Gap(before=7.4, after=8.3, floor=0.8, shrinks_by=(-0.14, -0.77, 0.69))
+    text = paragraph(diagnosis("explained_in_part", causes=(found,), named=("row_noise",), gap=wider))
+    assert "Of the catalogue it is most like: noise common to rows" in text
+    assert "does not fall (8.30) once that is added." in text
+    assert "explained by" not in text
+
+
+def test_a_session_whose_numbers_stop_early_has_a_gap_whatever_the_rest_says():
+    items = [
+        Hypothesis(effects=effects, probability=probability, log_evidence=0.0)
+        for effects, probability in (((), 0.93), ((UNKNOWN,), 0.02), (("image_lag",), 0.05))
+    ]
+    fields = dict.fromkeys(("gap", "twin", "held_out", "ambiguous_with", "next_measurement", "problem"))
+    fields |= {
+        "causes": (),
+        "where": (),
+        "added": (),
+        "named": (),
+        "threshold_z": 4.0,
+        "unknown_location": "level of flat",
+    }
+    agreed = Diagnosis(
+        verdict="no_gap", hypotheses=tuple(items), probability_no_gap=0.93, probability_unknown=0.02, **fields
+    )
+    found = _cut_off(agreed, "numbers stop at 41151 DN")
+    assert (found.verdict, found.probability_no_gap) == ("unknown_effect", 0.0)
+    assert found.probability_unknown == pytest.approx(0.95)
+    assert {item.effects: item.probability for item in found.hypotheses} == pytest.approx(
+        {(UNKNOWN,): 0.95, ("image_lag",): 0.05, (): 0.0}
+    )
+    assert found.notes == ("numbers stop at 41151 DN",)
+    assert _cut_off(replace(agreed, verdict="explained"), "numbers stop").verdict == "explained_in_part"
+
+
 def test_a_tie_names_its_members_and_the_measurement_that_would_break_it():
-    tied = (cause("image_lag", 0.5, (1.0, 0.5, 2.0)), cause("dark_drift", 0.4, (5.0, 2.0, 9.0), unit="DN"))
-    text = paragraph(diagnosis("ambiguous", causes=tied, next_measurement={"text": "take beam-off frames"}))
-    assert "(0.50)" in text and "(0.40)" in text
+    """What is not in the catalogue among them, and two effects at once as one explanation."""
+    tied = [
+        Hypothesis(effects=effects, probability=probability, log_evidence=0.0)
+        for effects, probability in ((("image_lag", "dark_drift"), 0.5), ((UNKNOWN,), 0.4), ((), 0.1))
+    ]
+    text = paragraph(diagnosis("ambiguous", hypotheses=tied, next_measurement={"text": "take beam-off frames"}))
+    both = f"{title_of('image_lag')} with {title_of('dark_drift')} (0.50)"
+    assert f"what causes it: {both}, an effect that is not in the catalogue (0.40)." in text
     assert text.rstrip(".").endswith("To tell them apart: take beam-off frames")
 
 

@@ -18,6 +18,7 @@ from raytwin.diagnosis.checks.preparation import prepare_session
 from raytwin.diagnosis.diagnose_session import diagnose
 from raytwin.diagnosis.model.changes import catalogue_variants
 from raytwin.diagnosis.problem.assemble import build_problem
+from raytwin.generator.effects import EFFECTS
 
 ALL = ("afterglow", "discs", "edges", "timed edges", "slabs", "wedge", "filter", "exposures", "turned")
 STRENGTHS = {"focal_spot": 0.6, "mtf_tail": 5.0, "image_lag": 0.3, "dark_drift": 3.0}
@@ -82,7 +83,8 @@ def test_an_edge_or_disc_is_asked_for_where_blur_of_the_source_ties_with_blur_of
     assert found.measurement.name in ("discs", "edges", "timed edges")
     assert found.separation_then > found.separation + 3.0
     text = proposal_text(found, tuple(first), tuple(second))
-    assert text.startswith(f"measure {found.measurement.text}, which would tell focal_spot from mtf_tail by")
+    titles = [EFFECTS[effect].title for effect in ("focal_spot", "mtf_tail")]
+    assert text.startswith(f"measure {found.measurement.text}, which would tell {titles[0]} from {titles[1]} by")
     # the answer's frames are drawn from the generator alone, and hardly matter
     again = best_measurement(diagnosis.problem, first, second, rng=np.random.default_rng(3))
     other = best_measurement(diagnosis.problem, first, second, rng=np.random.default_rng(4))

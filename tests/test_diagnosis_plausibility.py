@@ -373,3 +373,28 @@ def test_copies_of_frames_leave_the_noise_that_labels_are_judged_by():
     np.testing.assert_array_equal(copied.variance_DN2, plain.variance_DN2)
     np.testing.assert_array_equal(copied.mean_DN, plain.mean_DN)
     assert float(plain.variance_DN2.mean()) == pytest.approx(25.0, rel=0.1)
+
+
+def test_numbers_that_stop_below_those_of_other_series_are_told(changed):
+    """A converter ends at one number in all series: what stops earlier is no saturation."""
+
+    def change(file):
+        frames = file["series"][FLAT_90]["frames"]
+        frames[...] = np.minimum(frames[...], int(np.median(frames[...])))
+
+    found = found_in(changed(change))
+    assert "saturated" in found.unusable[FLAT_90]
+    assert found.stops.startswith(f"numbers of {FLAT_90} stop at ")
+    assert "go on to" in found.stops
+
+
+def test_a_converter_that_ends_at_one_number_in_all_series_is_only_saturated(changed):
+    def change(file):
+        lit = [node for node in file["series"].values() if node.attrs["kind"] != "dark"]
+        top = int(0.8 * max(np.median(node["frames"][...]) for node in lit))
+        for node in lit:
+            node["frames"][...] = np.minimum(node["frames"][...], top)
+
+    found = found_in(changed(change))
+    assert any("saturated" in reason for reason in found.unusable.values())
+    assert found.stops == ""

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from ...acquisition.acquisition_io import open_acquisition, write_acquisition
 from ...acquisition.setting import Filter, Setting, text_from_filters
 from ...errors import InputError, RaytwinError
+from ...generator.effects import EFFECTS
 from ...generator.frames.conditions import with_conditions
 from ...generator.frames.line_model import LineModel
 from ...generator.line.series_request import SeriesRequest
@@ -89,8 +90,12 @@ class Proposal:
 
 def proposal_text(proposal: Proposal, first: Sequence[str], second: Sequence[str]) -> str:
     """What to measure to tell two explanations (effects) apart, and how far apart it would set them."""
+    one, other = (
+        " and ".join(EFFECTS[effect].title if effect in EFFECTS else effect for effect in some)
+        for some in (first, second)
+    )
     return (
-        f"measure {proposal.measurement.text}, which would tell {' and '.join(first)} from {' and '.join(second)} by"
+        f"measure {proposal.measurement.text}, which would tell {one} from {other} by"
         f" {proposal.separation_then:.1f} standard deviations instead of {proposal.separation:.1f}"
     )
 

@@ -47,12 +47,13 @@ class Plausibility:
     """What was found.
 
     Fields: suspects, strongest first; unusable: series without any signal or noise, or saturated -> why; saturated: names of
-    those that were lit too much.
+    those that were lit too much; stops: what is said where numbers stop at one that others of the session exceed, else empty.
     """
 
     suspects: tuple[Suspect, ...]
     unusable: Mapping[str, str]
     saturated: frozenset[str] = frozenset()
+    stops: str = ""
 
 
 def check_plausibility(
@@ -106,6 +107,8 @@ def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int
     readings: list[Reading] = []
     unusable: dict[str, str] = {}
     saturated: set[str] = set()
+    stops: dict[str, float] = {}  # where the numbers of saturated series end
+    reached: dict[str, float] = {}  # what a share of the numbers of others exceed that bad pixels do not make up
     blank: dict[str, tuple[Reading, float]] = {}  # and the one number that all their pixels have
     for item in acquisition.series:
         if "log" in item.corrected or holds_shares(item):
@@ -120,8 +123,10 @@ def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int
         elif full > _SATURATED:
             unusable[item.name] = f"saturated: {100 * full:.0f} % of the pixels stand at {frames.max():.0f} DN"
             saturated.add(item.name)
+            stops[item.name] = float(frames.max())
         else:
             readings.append(found)
+            reached[item.name] = float(np.quantile(frames, 1.0 - _SATURATED))
     silent = silent_darks(acquisition, calibrating, blank)
     for name, (found, value_DN) in blank.items():
         top = is_top(value_DN, acquisition.instrument.bits)
@@ -132,7 +137,24 @@ def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int
         if top and found.series.kind in ("flat", "object"):
             saturated.add(name)
     readings.sort(key=lambda item: item.series.index)
-    return readings, Plausibility(suspects=(), unusable=unusable, saturated=frozenset(saturated))
+    told = _stops_text(stops, reached)
+    return readings, Plausibility(suspects=(), unusable=unusable, saturated=frozenset(saturated), stops=told)
+
+
+def _stops_text(stops: Mapping[str, float], reached: Mapping[str, float]) -> str:
+    """What is said of series whose numbers stop at one that another exceeds; empty where none does.
+
+    A converter's end is the same in all frames: what stops below it was cut off by something else.
+    """
+    brightest = max(reached, key=lambda name: reached[name], default="")
+    early = [name for name, top in stops.items() if brightest and top < reached[brightest]]
+    if not early:
+        return ""
+    more = f" and {len(early) - 1} more" if len(early) > 1 else ""
+    return (
+        f"numbers of {early[0]}{more} stop at {stops[early[0]]:.0f} DN, those of {brightest} go on to {reached[brightest]:.0f} DN:"
+        " something cuts them off that was not there always"
+    )
 
 
 def _less(readings: Sequence[Reading], suspects: Sequence[Suspect]) -> list[Reading]:

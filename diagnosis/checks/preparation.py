@@ -36,8 +36,9 @@ class PreparedSession:
     wrong); left_out (series that are not used, each with the reason); notes (how the session is looked at, and what calibration took
     in); factor (pixels along each side of the squares that acquisition and twin have as pixels); all_pixels (the same series with all
     pixels);
-    ends_at_zero (names of lit series whose numbers go down to 0 and not below); spectral_point (parameter,): where the twin's
-    spectral nuisances are taken as linear (None: at its best parameters).
+    ends_at_zero (names of lit series whose numbers go down to 0 and not below); stops (what is said of series whose numbers stop
+    below those of others; empty: none does); spectral_point (parameter,): where the twin's spectral nuisances are taken as linear
+    (None: at its best parameters).
     """
 
     acquisition: AcquisitionFile
@@ -50,6 +51,7 @@ class PreparedSession:
     factor: int
     all_pixels: AcquisitionFile
     ends_at_zero: frozenset[str]
+    stops: str
     spectral_point: NDArray[np.float64] | None
 
 
@@ -116,6 +118,7 @@ def prepare_session(
         ends_at_zero=frozenset(
             item.name for item in all_pixels.series if item.kind in ("flat", "object") and share_of_zeros(item) > 0.0
         ),
+        stops=found.stops,
         spectral_point=_spectral_point(acquisition, twin, rng=rng, progress=progress),
         all_pixels=replace(
             all_pixels, series=tuple(item for item in all_pixels.series if item.name not in found.unusable)

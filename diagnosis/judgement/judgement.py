@@ -378,7 +378,7 @@ def _of_another_strength(problem: Problem, verdict: Verdict) -> tuple[str, ...]:
 def _in_some(leading: Hypothesis) -> tuple[str, ...]:
     """What to say of effects that act in some series only."""
     return tuple(
-        f"{effect} acts in {', '.join(curve.variant.series)} only: the improved twin is left without it"
+        f"{EFFECTS[effect].title} acts in {', '.join(curve.variant.series)} only: the improved twin is left without it"
         for effect, curve in leading.variants.items()
         if curve.variant.series
     )

@@ -5,12 +5,16 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ...generator.effects import EFFECTS
+from ..inference.inference import UNKNOWN
 from ..judgement.answer import EXPLAINED, Cause, Diagnosis, Place
+from ..judgement.held_out import Gap
 
 # so many of a kind fit into a paragraph
 _NAMED = 3
 _NAMED_UNTESTED = 8  # names alone are shorter
 _NAMED_FAMILIES = 4
+_RIVALS, _LEAST_LIKELY = 5, 0.05  # explanations that are named where none leads
+_MOSTLY = 0.5  # of the gap above noise, from which what takes so much explains it
 _SHAPED_LIKE = "like "  # templates of what effects would do
 _KIND_WORDS = {"flat": "flats", "dark": "darks", "object": "objects", "afterglow": "frames after the beam"}
 _AXIS_WORDS = {
@@ -27,6 +31,8 @@ _AXIS_WORDS = {
 
 def title_of(effect: str) -> str:
     """The effect's name in words."""
+    if effect == UNKNOWN:
+        return "an effect that is not in the catalogue"
     return EFFECTS[effect].title if effect in EFFECTS else effect
 
 
@@ -157,7 +163,7 @@ def verdict_text(diagnosis: Diagnosis) -> str:
             f" {figures}."
         )
     if diagnosis.verdict == "ambiguous":
-        named = ", ".join(f"{title_of(cause.effect)} ({cause.probability:.2f})" for cause in diagnosis.causes[:5])
+        named = ", ".join(f"{title} ({probability:.2f})" for title, probability in rivals(diagnosis))
         text = f"{where} These data cannot tell apart what causes it: {named}. {figures}."
         if diagnosis.next_measurement:
             text += f" To tell them apart: {diagnosis.next_measurement['text']}."
@@ -166,13 +172,27 @@ def verdict_text(diagnosis: Diagnosis) -> str:
         f"{title_of(cause.effect)}, {strength_text(cause)}, probability {cause.probability:.2f}"
         for cause in diagnosis.leading
     )
-    text = f"{where} It is explained by: {named}. {figures}"
+    share = None if gap.shrinks_by is None else gap.shrinks_by[0]
+    found = "It is explained by" if share is None or share > _MOSTLY else "Of the catalogue it is most like"
+    text = f"{where} {found}: {named}. {figures}"
     if gap.shrinks_by is not None:
         value, low, high = (min(one, 1.0) for one in gap.shrinks_by)
-        text += f" and falls to {gap.after:.2f} once that is added, by {_percent((value, low, high))} of what is above noise."
+        share_text = f", by {_percent((value, low, high))} of what is above noise" if gap.after < gap.before else ""
+        text += f" and {fall_text(gap)} once that is added{share_text}."
     else:
         text += f" and {gap.after:.2f} after; it is too close to noise for a share to mean anything."
     return text + rest_text(diagnosis)
+
+
+def rivals(diagnosis: Diagnosis) -> list[tuple[str, float]]:
+    """Explanations that are not out of the question, in words, and their probabilities, most probable first."""
+    likely = [item for item in diagnosis.hypotheses if item.effects and item.probability >= _LEAST_LIKELY]
+    return [(" with ".join(map(title_of, item.effects)), item.probability) for item in likely[:_RIVALS]]
+
+
+def fall_text(gap: Gap) -> str:
+    """What becomes of the gap once what was found is added: a verb and the figure."""
+    return f"falls to {gap.after:.2f}" if gap.after < gap.before else f"does not fall ({gap.after:.2f})"
 
 
 def rest_text(diagnosis: Diagnosis) -> str:

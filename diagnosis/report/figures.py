@@ -71,16 +71,19 @@ def gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], *, cou
 
 
 def _telling_views(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], count: int) -> list[int]:
+    """Views with the most to show, one a kind, scene and voltage: what is taken of the gap, or the gap where that is nothing."""
     problem = diagnosis.compared
-    power = np.zeros(len(problem.views))
+    power, taken = np.zeros(len(problem.views)), np.zeros(len(problem.views))
     is_map = np.array([name.statistic == "mean frame" for name in problem.names])
     for index in range(len(problem.views)):
         chosen = (problem.series_of == index) & is_map
         power[index] = float(np.mean(problem.residual[chosen] ** 2)) if chosen.any() else 0.0
         view = problem.views[index]
         if diagnosis.added and view.mask.any():
-            taken = (view.residual_DN**2 - after[index] ** 2) / np.maximum(view.noise_DN, 1e-12) ** 2
-            power[index] = float(np.mean(taken[view.mask]))
+            less = (view.residual_DN**2 - after[index] ** 2) / np.maximum(view.noise_DN, 1e-12) ** 2
+            taken[index] = float(np.mean(less[view.mask]))
+    if float(taken.max(initial=0.0)) > 0.0:
+        power = taken
     seen: set[tuple[Any, ...]] = set()
     result = []
     for index in np.argsort(-power):

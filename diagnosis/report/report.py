@@ -14,8 +14,10 @@ from ..problem.assemble import map_changes
 from .explanation import (
     axis_text,
     compared_text,
+    fall_text,
     location_text,
     rest_text,
+    rivals,
     strained_text,
     strength_text,
     task_text,
@@ -108,7 +110,7 @@ def headline(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "unknown_effect":
         return "An effect that is not in the catalogue"
     if diagnosis.verdict == "ambiguous":
-        names = [title_of(cause.effect) for cause in diagnosis.causes[:3]]
+        names = [title for title, _ in rivals(diagnosis)[:3]]
         return _sentence(f"{' or '.join(names)}: these data cannot distinguish them")
     named = _sentence(" and ".join(f"{title_of(cause.effect)}, {strength_text(cause)}" for cause in diagnosis.leading))
     return f"{named}: its law leaves a rest" if diagnosis.verdict == "explained_in_part" else named
@@ -129,7 +131,7 @@ def lead_text(diagnosis: Diagnosis) -> str:
         return verdict_text(diagnosis)
     place = diagnosis.where[0]
     seen = f"The gap is clearest in the {axis_text(place.axis)} of {place.series}"
-    ends = f"the gap on series that the fit did not use falls from {gap.before:.2f} to {gap.after:.2f} (1: noise alone)"
+    ends = f"the gap on series that the fit did not use, {gap.before:.2f} (1: noise alone), {fall_text(gap)}"
     return f"{seen}. With what was found added to the twin, {ends}.{rest_text(diagnosis)}"
 
 

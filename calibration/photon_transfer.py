@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..generator.line.twin import DetectorMaps, Estimate, Level, NoiseModel, SpreadEstimate, estimate_from_sd
 from ._kept_sums import KeptSums, SumsKeeper
 from .bad_pixels import cluster_evidence, find_bad_pixels
+from .common_noise import common_variance
 from .dark_frames import DarkFrames, dark_estimate, dark_map_sd, read_variance_map, sum_darks
 from .flat_evidence import flat_evidence, session_evidence
 from .flat_levels import SeriesPoint, gain_map_of, levels_of, series_points, with_noise_of_others
@@ -412,6 +413,7 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
             read_noise_DN=_root_estimate(read_DN2, fit.read_sd_DN2, fit.most_read_DN2),
             quantised=quantised,
             shared_gain_sd=fit.shared_gain_sd,
+            common_variance=common_variance(points, noise),
         ),
         dark_DN=dark_DN,
         levels=levels_of(session.acquisition, noise, darks, good, points=points, saturation_DN=flats.saturation_DN),

@@ -313,13 +313,21 @@ def validate_twin(
         pixels = int(good.sum())
         # quantum noise is correlated: the mean over pixels carries gain, not slope
         spread = predicted.gain_DN.value * mean / item.averaged + twin.noise.read_variance_DN2 / item.averaged
+        common = (
+            0.0 if twin.noise.common_variance is None else twin.noise.common_variance.value * mean**2 / item.averaged
+        )
         mean_sd = math.sqrt(max(spread, variance or 0.0) / total.frames / pixels) * 1.2533
+        # what pixels share does not average out over them
+        mean_sd = math.hypot(mean_sd, math.sqrt(common / total.frames))
         noise_sd = 0.0
         if variance is not None:
             # neighbours share quantum noise, so a variance over pixels counts fewer of them: by the sum of squared correlations
             quantum = min(max(1.0 - twin.noise.read_variance_DN2 / item.averaged / variance, 0.0), 1.0)
             shared = 1.0 + quantum**2 * (squared_correlations - 1.0)
-            noise_sd = math.sqrt(0.5 * variance * shared / (effective_frames(total.frames) * pixels))
+            sampling = 2.0 * (variance**2 * shared / pixels + common**2) / effective_frames(total.frames)
+            # noise of the pixel with the median signal, which the prediction is of: quanta follow the signal
+            variance *= 1.0 - quantum * (1.0 - mean / float(np.mean(signal[good])))
+            noise_sd = 0.5 * math.sqrt(sampling / variance)
         rows.append(
             ValidationRow(
                 series=item.name,

@@ -104,6 +104,22 @@ def test_a_clean_session_gives_its_truth_and_no_warning(clean):
     assert all(point.used for point in clean.points)
 
 
+def test_what_pixels_share_is_predicted_as_noise_of_a_pixel(tmp_path, clean):
+    """Whole rows that flicker with the light: no frame factor, and nothing of it in the gain."""
+    rms = 0.02
+
+    def flickering(frames, setting, rng):
+        factors = 1.0 + rms * rng.standard_normal((*frames.shape[:2], 1))
+        return DARK_DN + (frames - DARK_DN) * factors if setting is not None else frames
+
+    found = transfer_of(write_session(tmp_path / "rows.h5", change=flickering))
+    assert is_gain(found.levels[0].gain_DN)
+    shared = found.noise.common_variance
+    assert shared.low < rms**2 < shared.high < 1.5 * rms**2
+    assert clean.noise.common_variance.low == 0.0
+    assert clean.noise.common_variance.high < 0.1 * rms**2
+
+
 def test_evidence_of_a_clean_session_shows_nothing(clean):
     evidence = clean.evidence
     assert evidence["stack_over_pair_variance"] == pytest.approx(1.0, abs=0.01)

@@ -178,7 +178,8 @@ class NoiseModel:
     Fields: spread; white_fraction: signal-following white variance over the quantum variance before
     the spread; read_noise_DN: electronic noise of one frame without the ADC's rounding; quantised: whole DN;
     shared_gain_sd: relative standard deviation of gain over photon-transfer slope, by which the gains of all beams are off alike;
-    None: not known apart from the levels' intervals.
+    None: not known apart from the levels' intervals; common_variance: of what pixels of a frame share and the next frame has
+    otherwise (output, lines, a source that wanders), relative to the squared signal; None: not known.
     """
 
     spread: SpreadEstimate
@@ -186,6 +187,7 @@ class NoiseModel:
     read_noise_DN: Estimate
     quantised: bool
     shared_gain_sd: float | None = None
+    common_variance: Estimate | None = None
 
     @property
     def read_variance_DN2(self) -> float:

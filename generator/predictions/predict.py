@@ -471,11 +471,15 @@ def _of_frames(twin: Twin, setting: Setting, flat: _Flat, warnings: list[str]) -
             warnings.append("binning is taken as the mean of pixels after readout; declare binning_adds if it is not")
     read = twin.noise.read_noise_DN
     read_DN2 = twin.noise.read_variance_DN2 * binned.electronic
-    variance_draws = np.maximum(quantum_DN2, 0.0) + max(read_DN2, 1e-12)
+    common = twin.noise.common_variance or Estimate(value=0.0, low=0.0, high=0.0)
+    common_DN2 = common.value * mean_DN.value**2
+    variance_draws = np.maximum(quantum_DN2, 0.0) + max(read_DN2, 1e-12) + common_DN2
     variance = float(np.median(variance_draws))
-    of_quanta = max(variance - read_DN2, 0.0) * flat.quantum_sd
+    of_quanta = max(variance - read_DN2 - common_DN2, 0.0) * flat.quantum_sd
     of_reading = 2.0 * read.value * (read.high - read.low) / (2 * 1.959964) * binned.electronic
-    relative_sd = 0.5 * math.hypot(of_quanta, of_reading) / variance
+    # cut at 0, so that its upper end alone has the full width
+    of_common = (common.high - common.value) / 1.959964 * mean_DN.value**2
+    relative_sd = 0.5 * math.hypot(of_quanta, of_reading, of_common) / variance
     saturated = saturation_text(twin, setting, mean_DN.value)
     if saturated:
         warnings.append(saturated)

@@ -136,6 +136,8 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
         noise.attrs["quantised"] = twin.noise.quantised
         if twin.noise.shared_gain_sd is not None:
             noise.attrs["shared_gain_sd"] = twin.noise.shared_gain_sd
+        if twin.noise.common_variance is not None:
+            _put_estimate(noise, "common_variance", twin.noise.common_variance)
         exact = Estimate(value=spread.value.sigma_px, low=spread.value.sigma_px, high=spread.value.sigma_px)
         _put_estimate(noise, "psf_sigma_px", spread.intervals.get("sigma_px", exact))
         _put_estimate(noise, "read_noise_DN", twin.noise.read_noise_DN)
@@ -310,6 +312,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
             read_noise_DN=_required(_get_estimate(noise, "read_noise_DN"), "read_noise_DN", path),
             quantised=bool(noise.attrs["quantised"]),
             shared_gain_sd=_optional_float(noise, "shared_gain_sd"),
+            common_variance=_get_estimate(noise, "common_variance"),
         ),
         dark_DN=_required(_get_estimate(noise, "dark_DN"), "dark_DN", path),
         levels=tuple(levels),

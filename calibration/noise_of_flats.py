@@ -8,12 +8,14 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.acquisition_io import AcquisitionFile, Series
+from ..acquisition.acquisition_io import PIECE_BYTES, AcquisitionFile, Series
 from ..acquisition.instrument import Instrument
 from ..errors import FitError, InputError
+from ..generator.line.twin import Z95
 from ..materials import material_from_name
 from ._kept_sums import KeptSums
 from .dark_frames import DarkFrames
+from .frame_memory import frame_memory
 from .frame_sums import effective_frames
 from .noise_power import NoisePower, compute_difference_power, compute_noise_power
 from .repeated_frames import Beam, RepeatedFrames, beam_of, most_read_variance, widened
@@ -25,7 +27,6 @@ _PHOTOCONDUCTORS = tuple(
     for elements in ("Se", "Si", "Ge", "Ga As", "Cd Te", "Cd Zn Te", "Hg I", "Pb I", "Pb O", "C")
 )
 POWER_FRAMES = 400
-PIECE_BYTES = 8 * 2**20
 _POWER_SAMPLES = 3e7  # pixels x frames a series; the gain is then known to about 0.1 %
 
 
@@ -182,13 +183,29 @@ def fit_flat_noise(
         in_fit[worst] = False
         bent.append(stacks[worst][0].name)
         fit = _fit(powers, groups, in_fit, most_read, screen)
-    half = 1.959964 * fit.gain_sd_DN
+    memory = frame_memory(stacks, darks, good)
+    if memory is not None:
+        # the quanta's share lies between what pairs show and what many frames do
+        off = abs(memory.ratio - 1.0) / Z95
+        fit = replace(
+            fit,
+            gain_sd_DN=np.hypot(fit.gain_sd_DN, off * fit.gain_DN),
+            shared_gain_sd=math.hypot(fit.shared_gain_sd, off),
+        )
+        warnings.append(
+            f"noise of a frame is correlated with that of the next one by {100.0 * memory.next_frame:.2g} %: an image lag or a"
+            f" recursive filter; noise of many frames is {memory.ratio:.3g} times that of pairs, and the gains' intervals hold both"
+        )
+    half = Z95 * fit.gain_sd_DN
     if np.all(fit.gain_DN < half):
         best = int(np.argmax(fit.gain_DN / half))
-        raise FitError(
-            f"the noise tells no gain: {fit.gain_DN[best]:.3g} +- {half[best]:.2g} DN at best; the spread is too wide for frames"
-            " of this size, or what changes between the frames hides the quanta: take larger frames, in a row"
+        why = (
+            "the spread is too wide for frames of this size, or what changes between the frames hides the quanta: take larger frames,"
+            " in a row"
+            if memory is None or memory.ratio < 2.0
+            else f"{warnings[-1]}: switch filters off, or take single frames with pauses"
         )
+        raise FitError(f"the noise tells no gain: {fit.gain_DN[best]:.3g} +- {half[best]:.2g} DN at best; {why}")
     warnings += [
         f"left out of the fit: {name} (its variance bends away from the photon-transfer line)" for name in bent
     ]

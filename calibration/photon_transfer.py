@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.acquisition_io import AcquisitionFile, Series
+from ..acquisition.acquisition_io import PIECE_BYTES, AcquisitionFile, Series
 from ..errors import InputError
 from ..generator.line.twin import DetectorMaps, Estimate, Level, NoiseModel, SpreadEstimate, estimate_from_sd
 from ._kept_sums import KeptSums, SumsKeeper
@@ -24,7 +24,7 @@ from .flat_levels import SeriesPoint, gain_map_of, levels_of, series_points, wit
 from .frame_checks import repeated_frame_indices, same_scene
 from .frame_sums import sum_frames
 from .full_scale import full_scale_reached, reaches, top_of_range
-from .noise_of_flats import PIECE_BYTES, FlatNoise, FlatPair, fit_flat_noise, pairs_of_singles
+from .noise_of_flats import FlatNoise, FlatPair, fit_flat_noise, pairs_of_singles
 from .noise_power import SMALLEST_SQUARE_PX
 from .repeated_frames import (
     OPEN,

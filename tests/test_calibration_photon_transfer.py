@@ -9,7 +9,7 @@ from raytwin.acquisition import Setting, open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.calibration.calibrate import bad_pixel_counts, calibrate_twin, calibration_answer
 from raytwin.calibration.photon_transfer import compute_photon_transfer
-from raytwin.errors import InputError
+from raytwin.errors import FitError, InputError
 from raytwin.generator.line.twin import BAD_PIXEL_CODES
 from raytwin.generator.spread.noise import sample_frame_noise
 from raytwin.generator.spread.psf import Spread, blur_variance_share
@@ -102,6 +102,30 @@ def test_a_clean_session_gives_its_truth_and_no_warning(clean):
     assert level.saturation_DN is None
     assert np.all(clean.maps.bad_pixels == 0)
     assert all(point.used for point in clean.points)
+
+
+@pytest.mark.parametrize(("share", "known"), [(0.1, True), (0.7, False)])
+def test_frames_that_hold_a_share_of_the_last_one_widen_the_gain_or_give_none(tmp_path, share, known):
+    """Differences show (1 - a)^2 / (1 + a) of the noise: a third less for a tenth, nearly all for seven."""
+
+    def filtered(frames, setting, rng):
+        kept = frames[0]
+        result = []
+        for frame in frames:
+            kept = share * kept + (1.0 - share) * frame
+            result.append(kept)
+        return np.array(result)
+
+    path = write_session(tmp_path / "filter.h5", change=filtered)
+    if not known:
+        with pytest.raises(FitError, match="a recursive filter"):
+            transfer_of(path)
+        return
+    found = transfer_of(path)
+    gain = found.levels[0].gain_DN
+    assert gain.value < 0.85 * GAIN
+    assert gain.low < GAIN < gain.high
+    assert any("recursive filter" in text for text in found.warnings)
 
 
 def test_what_pixels_share_is_predicted_as_noise_of_a_pixel(tmp_path, clean):

@@ -237,6 +237,17 @@ def test_both_of_a_planted_pair_are_named(setup):
     assert both >= 8
 
 
+def test_what_two_laws_describe_badly_may_be_an_effect_that_is_only_like_them(setup):
+    rng, factors, chosen = setup
+    unknown = []
+    for off in (0.0, 1.2):
+        laws = [curve.response(60.0) * (1.0 + off * rng.standard_normal(PROBES)) for curve in (chosen[0], chosen[5])]
+        found = weigh(noise(rng, factors) + sum(laws), factors, chosen)
+        assert set(found[0].effects) == {chosen[0].effect, chosen[5].effect}
+        unknown.append(sum(item.probability for item in found if item.effects == (UNKNOWN,)))
+    assert unknown[0] < 0.01 < 0.02 < unknown[1]
+
+
 def test_departure_that_no_effect_makes_is_unknown_and_placed(setup):
     rng, factors, chosen = setup
     residual = noise(rng, factors)

@@ -32,6 +32,7 @@ from scipy.ndimage import gaussian_filter
 
 from raytwin.acquisition import open_acquisition
 from raytwin.diagnosis.diagnose_session import diagnose
+from raytwin.diagnosis.judgement.answer import Diagnosis
 from raytwin.errors import InputError
 
 ENERGY_keV = np.arange(5, 121) + 0.5  # middles of bins of 1 keV
@@ -647,28 +648,38 @@ class Session:
                 group.create_dataset(f"thickness_mm/{material}", data=thickness_mm.astype(np.float32))
 
 
+def diagnosis_of(session: Session, path: Path, seed: int) -> Diagnosis:
+    """The diagnosis of a session, once it is taken and written."""
+    session.take()
+    session.write(path)
+    with open_acquisition(path) as acquisition:
+        return diagnose(acquisition, rng=np.random.default_rng(seed))
+
+
+def answer_text(found: Diagnosis) -> str:
+    """Verdict, what is named, and with which strengths."""
+    nothing = {"no_gap": found.probability_no_gap, "unknown_effect": found.probability_unknown}
+    words = found.verdict + (f" {nothing[found.verdict]:.2f}" if found.verdict in nothing else "")
+    for cause in found.leading:
+        low, value, high = sorted(cause.sign * one for one in cause.strength)
+        words += (
+            f"; {cause.effect} {cause.probability:.2f}, {value:.3g} ({low:.3g} to {high:.3g}) {cause.unit}".rstrip()
+        )
+    return words
+
+
 def judged(line: str, case: str, seed: int, folder: Path) -> tuple[bool, str]:
     """Whether the planted effects, and nothing else, are named in the session of a case, and what was planted and found in words."""
     planted = {name: strength for name, strength in CASES[line][case].items() if name not in NOT_NAMED}
     words = "planted " + (
         " + ".join(f"{name} {one:g} {UNITS.get(name, '%')}" for name, one in planted.items()) or "nothing"
     )
-    path = folder / f"{line}_{case}_{seed}.h5"
     session = Session(LINES[line], CASES[line][case], np.random.default_rng(seed))
-    session.take()
-    session.write(path)
     try:
-        with open_acquisition(path) as acquisition:
-            found = diagnose(acquisition, rng=np.random.default_rng(seed))
+        found = diagnosis_of(session, folder / f"{line}_{case}_{seed}.h5", seed)
     except InputError as error:
         return False, f"{words}; refused: {error}"
-    nothing = {"no_gap": found.probability_no_gap, "unknown_effect": found.probability_unknown}
-    words += f"; {found.verdict}" + (f" {nothing[found.verdict]:.2f}" if found.verdict in nothing else "")
-    for cause in found.leading:
-        low, value, high = sorted(cause.sign * one for one in cause.strength)
-        words += (
-            f"; {cause.effect} {cause.probability:.2f}, {value:.3g} ({low:.3g} to {high:.3g}) {cause.unit}".rstrip()
-        )
+    words += f"; {answer_text(found)}"
     verdicts = ("explained", "explained_in_part") if planted else ("no_gap",)
     return found.verdict in verdicts and set(found.named) == set(planted), words
 

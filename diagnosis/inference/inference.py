@@ -8,9 +8,9 @@ responses to the nuisances times their prior standard deviations.
     effect    m = m_e(s), s the strength, log-uniform over its plausible range; its law is off by a level and may leave a rest in
               any families of probes (`discrepancy`), over which the evidence is averaged; what it does by chance is extra covariance
     pair      m = m_e(s) + m_f(t), each law off by a level of its own
-    unknown   m = 0 and an extra variance in any number of families of probes; or like an effect of the catalogue, of any strength
-              that is tried (what the twin has: of a plausible one), as far off as effects of other kinds are from the law that
-              resembles them most
+    unknown   m = 0 and an extra variance in any number of families of probes; or like an effect of the catalogue, or like two, of
+              any strength that is tried (what the twin has: of a plausible one), as far off as effects of other kinds are from the
+              law that resembles them most
 """
 
 import math
@@ -114,13 +114,13 @@ def _weighed(
     nothing = left.no_effect(rests)
     weighed = [(nothing, math.log(priors.none))]
     of_single = math.log(priors.single / count)
-    alike, whole = [], {}
+    alike, like_two, whole = [], [], {}
     for effect in ranked:
         single = singles[effect]
         found = _of_fits((effect,), {effect: single.best}, single.log_evidence)
         found = replace(found, strengths={effect: interval_of(single.fits)})
         if effect in ranked[:looked_at]:
-            found = left.of_kind(found, [single.best])
+            found = left.of_kind(found, [single.best])[0]
             alike.append(left.of_another(single))
         weighed.append((found, of_single))
         whole[effect] = found
@@ -132,7 +132,8 @@ def _weighed(
     for number, pair in enumerate(weigh_pairs(observed, singles, leading=_PAIRS_FROM, beside=beside)):
         found = _of_fits(pair.effects, pair.fits, pair.log_evidence)
         if number < looked_at:
-            found = left.of_kind(found, list(pair.fits.values()))
+            found, another = left.of_kind(found, list(pair.fits.values()))
+            like_two.append(another)
         weighed.append((found, of_pair))
         # or the weaker of them is what the stronger one's law leaves; not one that the twin has, which would have to be there
         strong, leaves = left_by_the_stronger(observed, pair)
@@ -144,8 +145,12 @@ def _weighed(
         if alone.log_evidence > leaks.get(strong, singles[strong]).log_evidence:
             leaks[strong] = alone
     weighed += [(item, of_single) for item in leaks.values()]
-    likest = float(np.logaddexp.reduce(alike)) - math.log(count) if alike else -math.inf
-    evidence = float(np.logaddexp(none.log_evidence, likest)) - math.log(2.0)
+    of_one = float(np.logaddexp.reduce(alike)) - math.log(count) if alike else -math.inf
+    of_two = (
+        float(np.logaddexp.reduce(like_two)) - math.log(max(count * (count - 1) // 2, 1)) if like_two else -math.inf
+    )
+    # like none of the catalogue, like one or like two, each as likely
+    evidence = float(np.logaddexp.reduce([none.log_evidence, of_one, of_two])) - math.log(3.0)
     unknown = Hypothesis(effects=(UNKNOWN,), probability=0.0, log_evidence=evidence, location=none.place)
     weighed.append((unknown, math.log(priors.unknown)))
     return weighed
@@ -196,8 +201,8 @@ def evidence_with_rest(
     another: they are only like these.
     """
     rests = _Rests(observed, families)
-    evidence, found = rests.beside(points, another=another)
-    return evidence, rests.ratio(points, found)
+    evidence, found = rests.beside(points)
+    return evidence + rests.prior(points, another=another), rests.ratio(points, found)
 
 
 class _Rests:
@@ -216,10 +221,16 @@ class _Rests:
         found = beyond(self._observed.standing(), self._families, left_by_laws=True)
         return self._weighed(plain, [], found.log_evidence, found)
 
-    def of_kind(self, hypothesis: Hypothesis, fits: Sequence[CurveFit]) -> Hypothesis:
-        """A hypothesis whose laws may leave a rest; fits: of its effects, whose curves are in the first units."""
+    def of_kind(self, hypothesis: Hypothesis, fits: Sequence[CurveFit]) -> tuple[Hypothesis, float]:
+        """A hypothesis whose laws may leave a rest, and log evidence over none of what is only like its effects.
+
+        fits: of its effects, whose curves are in the first units.
+        """
         points = [fit.point for fit in fits]
-        return self._weighed(hypothesis, points, *self.beside(points))
+        evidence, found = self.beside(points)
+        another = evidence + self.prior(points, another=True)
+        whole = self._weighed(hypothesis, points, evidence + self.prior(points), found)
+        return whole, self._like(points, another - found.log_evidence, another, found)
 
     def _weighed(self, hypothesis: Hypothesis, points: Sequence[Point], evidence: float, found: Beyond) -> Hypothesis:
         """A hypothesis with log evidence `evidence` where there is a rest `found`, and without."""
@@ -248,27 +259,36 @@ class _Rests:
         full = [fit for fit in single.fits if len(fit.by_level) > 1]
         plain = log_mean_exp([fit.of_another(any_strength=any_strength) for fit in full])
         points = [single.best.at_level(LEVELS.levels[-1])]
-        evidence, found = self.beside(points, another=True)
+        evidence, found = self.beside(points)
+        return self._like(points, plain, evidence + self.prior(points, another=True), found)
+
+    def _like(self, points: Sequence[Point], plain: float, evidence: float, found: Beyond) -> float:
+        """Log evidence of what is only like effects: `plain` without a rest, `evidence` with the one that was found."""
         evidence += log_rest(self.ratio(points, found), another=True) - LOG_DENSITY
         share = LEVELS.rest_of_another
         return float(np.logaddexp(plain + math.log1p(-share), evidence + math.log(share)))
 
-    def beside(self, points: Sequence[Point], *, another: bool = False) -> tuple[float, Beyond]:
-        """Log evidence over none of effects at their points with a rest beside them, and what that rest is."""
+    def beside(self, points: Sequence[Point]) -> tuple[float, Beyond]:
+        """Log evidence over none, without priors, of effects at their points with a rest beside them, and what that rest is."""
         effects = [point.curve.effect for point in points]
         alone = beside = self._observed.standing(*effects)
-        priors = 0.0
+        for point in points:
+            beside = beside.beside(point)
+        found = beyond(beside, self._families, left_by_laws=True)
+        evidence = self._observed.over_none(*effects) + beside.log_likelihood - alone.log_likelihood
+        return evidence + found.log_evidence, found
+
+    def prior(self, points: Sequence[Point], *, another: bool = False) -> float:
+        """Log of what effects at their points take of the prior; another: of what is only like them."""
+        alone = self._observed.standing(*(point.curve.effect for point in points))
+        total = 0.0
         for point in points:
             others = alone
             for other in points:
                 others = others if other is point else others.beside(other)
             any_strength = another and self._any_strength(point.curve.effect)
-            priors += log_prior(others, point, another=another, any_strength=any_strength)
-            beside = beside.beside(point)
-        found = beyond(beside, self._families, left_by_laws=True)
-        evidence = self._observed.over_none(*effects) + beside.log_likelihood - alone.log_likelihood
-        evidence += found.log_evidence + priors
-        return evidence, found
+            total += log_prior(others, point, another=another, any_strength=any_strength)
+        return total
 
 
 def _of_fits(effects: tuple[str, ...], fits: Mapping[str, CurveFit], log_evidence: float) -> Hypothesis:

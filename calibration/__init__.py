@@ -14,6 +14,8 @@ Files:
     spread_fit            optical spread, gain and read noise from the noise power of all series
     noise_of_flats        the series that this fit takes
     repeated_frames       noise where flats are single frames
+    common_noise          noise that the pixels of a frame share
+    frame_memory          noise that frames take over from those before them
     spectral_fit          posterior of tube, filtration and scintillator
     priors                what is known before flats are looked at
     wedges                plates of known thickness

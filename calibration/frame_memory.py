@@ -56,21 +56,27 @@ def frame_memory(
         for item, total in flats
         if total.frames >= _LEAST_FRAMES and item.averaged == 1
     ]
-    # in units of each series' own noise; series of fewer frames reach less far
+    # series of fewer frames reach less far
     lags = min((len(one[0]) for one in found if len(one)), default=0) // 2
-    rows = [one[:, :lags] / one[:, lags:].mean() for one in found if len(one)]
+    rows = [_correlations(one, lags) for one in found if len(one)]
     if not rows or lags < 1:
         return None
-    tiles = 1.0 - np.concatenate(rows)
-    correlation = tiles.mean(axis=0)
-    error = tiles[:, 0].std(ddof=1) / math.sqrt(len(tiles))
-    if abs(correlation[0]) < -float(ndtri(0.5 * _CHANCE)) * error:
+    tiles = np.concatenate(rows)
+    correlation, error = tiles.mean(axis=0), tiles.std(axis=0, ddof=1) / math.sqrt(len(tiles))
+    if abs(correlation[0]) < -float(ndtri(0.5 * _CHANCE)) * error[0]:
         return None
     # lags at which nothing is seen bring noise alone
-    seen = np.abs(correlation) > 2.0 * tiles.std(axis=0, ddof=1) / math.sqrt(len(tiles))
+    seen = np.abs(correlation) > 2.0 * error
     last = lags if seen.all() else int(np.argmin(seen))
     total = 1.0 + 2.0 * float(correlation[:last].sum())
     return FrameMemory(next_frame=float(correlation[0]), ratio=total / (1.0 - float(correlation[0])))
+
+
+def _correlations(differences: FloatArray, lags: int) -> FloatArray:
+    """rho_k of the first lags (tile, lag): D_k over that of later lags, each counted with its pairs of frames."""
+    pairs = np.arange(differences.shape[1], 0, -1)
+    late = np.average(differences[:, lags:], axis=1, weights=pairs[lags:])
+    return np.asarray(1.0 - differences[:, :lags] / late[:, None])
 
 
 def _differences(item: Series, total: KeptSums, dark: FloatArray, good: NDArray[np.bool_]) -> FloatArray:

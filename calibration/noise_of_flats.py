@@ -185,12 +185,13 @@ def fit_flat_noise(
         fit = _fit(powers, groups, in_fit, most_read, screen)
     memory = frame_memory(stacks, darks, good)
     if memory is not None:
-        # the quanta's share lies between what pairs show and what many frames do
+        # the quanta's share lies between what pairs show and what many frames do, and so does that of the electronics
         off = abs(memory.ratio - 1.0) / Z95
         fit = replace(
             fit,
             gain_sd_DN=np.hypot(fit.gain_sd_DN, off * fit.gain_DN),
             shared_gain_sd=math.hypot(fit.shared_gain_sd, off),
+            read_sd_DN2=math.hypot(fit.read_sd_DN2, off * fit.read_variance_DN2),
         )
         warnings.append(
             f"noise of a frame is correlated with that of the next one by {100.0 * memory.next_frame:.2g} %: an image lag or a"

@@ -18,9 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.acquisition_io import PIECE_BYTES, Series
+from ..acquisition.acquisition_io import Series
 from ._kept_sums import KeptSums
 from .dark_frames import DarkFrames
+from .frame_checks import repeats_the_last
+from .frame_sums import PIECE_BYTES
 
 _LEAST_FRAMES = 6  # half of the lags show what noise is once nothing is shared
 _MOST_FRAMES = 48
@@ -58,10 +60,10 @@ def frame_memory(
     ]
     # series of fewer frames reach less far
     lags = min((len(one[0]) for one in found if len(one)), default=0) // 2
-    rows = [_correlations(one, lags) for one in found if len(one)]
-    if not rows or lags < 1:
+    rows = [_correlations(one, lags) for one in found if len(one) and lags]
+    tiles = np.concatenate(rows) if rows else np.zeros((0, 1))
+    if len(tiles) < 2:
         return None
-    tiles = np.concatenate(rows)
     correlation, error = tiles.mean(axis=0), tiles.std(axis=0, ddof=1) / math.sqrt(len(tiles))
     if abs(correlation[0]) < -float(ndtri(0.5 * _CHANCE)) * error[0]:
         return None
@@ -73,26 +75,31 @@ def frame_memory(
 
 
 def _correlations(differences: FloatArray, lags: int) -> FloatArray:
-    """rho_k of the first lags (tile, lag): D_k over that of later lags, each counted with its pairs of frames."""
+    """rho_k of the first lags, of tiles with noise (tile, lag): D_k over that of later lags, each counted with its pairs of frames."""
     pairs = np.arange(differences.shape[1], 0, -1)
     late = np.average(differences[:, lags:], axis=1, weights=pairs[lags:])
-    return np.asarray(1.0 - differences[:, :lags] / late[:, None])
+    noisy = late > 0
+    return np.asarray(1.0 - differences[noisy, :lags] / late[noisy, None])
 
 
 def _differences(item: Series, total: KeptSums, dark: FloatArray, good: NDArray[np.bool_]) -> FloatArray:
-    """D_k of a series in each tile (tile, lag), DN^2, tiles without good pixels left out."""
+    """D_k of a series in each tile (tile, lag), DN^2; tiles without good pixels and copies of frames are left out."""
     middle = tuple(
         slice(max(0, (side - _SIDE_PX) // 2), max(0, (side - _SIDE_PX) // 2) + _SIDE_PX) for side in good.shape
     )
     level = float(np.mean((total.mean_DN - dark)[good]))
     frames: list[FloatArray] = []
+    last = None
     for piece in item.iter_frames(maximum_bytes=PIECE_BYTES):
-        for frame in piece[: _MOST_FRAMES - len(frames)]:
+        own, last = piece[~repeats_the_last(piece, last)], piece[-1]
+        for frame in own[: _MOST_FRAMES - len(frames)]:
             signal = frame.astype(np.float64) - dark
             mean = float(np.mean(signal[good]))
             frames.append(_sharp((signal * (level / mean) if mean > 0 < level else signal)[middle]))
         if len(frames) >= _MOST_FRAMES:
             break
+    if len(frames) < _LEAST_FRAMES:
+        return np.zeros((0, 1))
     whole: NDArray[np.bool_] = np.all(_blocks(good[middle]), axis=-1)
     result = []
     for rows in np.array_split(np.arange(whole.shape[0]), _TILES):

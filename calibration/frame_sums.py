@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .frame_checks import repeats_the_last
 
+PIECE_BYTES = 8 * 2**20  # of frames that are read at once
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameSums:

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.acquisition_io import PIECE_BYTES, AcquisitionFile, Series
+from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.instrument import Instrument
 from ..errors import FitError, InputError
 from ..generator.line.twin import Z95
@@ -16,7 +16,7 @@ from ..materials import material_from_name
 from ._kept_sums import KeptSums
 from .dark_frames import DarkFrames
 from .frame_memory import frame_memory
-from .frame_sums import effective_frames
+from .frame_sums import PIECE_BYTES, effective_frames
 from .noise_power import NoisePower, compute_difference_power, compute_noise_power
 from .repeated_frames import Beam, RepeatedFrames, beam_of, most_read_variance, widened
 from .spread_fit import SpreadFit, fit_spread

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.acquisition_io import PIECE_BYTES, AcquisitionFile, Series
+from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..errors import InputError
 from ..generator.line.twin import DetectorMaps, Estimate, Level, NoiseModel, SpreadEstimate, estimate_from_sd
 from ._kept_sums import KeptSums, SumsKeeper
@@ -22,7 +22,7 @@ from .dark_frames import DarkFrames, dark_estimate, dark_map_sd, read_variance_m
 from .flat_evidence import flat_evidence, session_evidence
 from .flat_levels import SeriesPoint, gain_map_of, levels_of, series_points, with_noise_of_others
 from .frame_checks import repeated_frame_indices, same_scene
-from .frame_sums import sum_frames
+from .frame_sums import PIECE_BYTES, sum_frames
 from .full_scale import full_scale_reached, reaches, top_of_range
 from .noise_of_flats import FlatNoise, FlatPair, fit_flat_noise, pairs_of_singles
 from .noise_power import SMALLEST_SQUARE_PX

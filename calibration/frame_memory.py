@@ -75,7 +75,7 @@ def frame_memory(
 
 
 def _correlations(differences: FloatArray, lags: int) -> FloatArray:
-    """rho_k of the first lags, of tiles with noise (tile, lag): D_k over that of later lags, each counted with its pairs of frames."""
+    """rho_k of the first lags, of tiles with noise (tile, lag): D_k over that of later lags, each counted with its pairs."""
     pairs = np.arange(differences.shape[1], 0, -1)
     late = np.average(differences[:, lags:], axis=1, weights=pairs[lags:])
     noisy = late > 0

@@ -114,12 +114,17 @@ def better_curve(found: tuple[Alternative, ...], fit: PodFit) -> Alternative | N
     return best if fit.aic > best.aic + _ALIKE else None
 
 
+def ends_below_90(curve: Alternative) -> bool:
+    """Whether a curve has a ceiling of 90 % at most."""
+    return curve.ceiling is not None and curve.ceiling <= 0.9
+
+
 def widened(fit: PodFit, joined: OverLinks, best: Alternative) -> PodFit:
     """A fit whose bounds on a90 reach as far as those of all curves together; None where one of these has none.
 
     best: the curve that fits better than this one. Where it ends below 90 %, there is no a90.
     """
-    if best.a90 is None and best.ceiling is not None and best.ceiling <= 0.9:
+    if ends_below_90(best):
         without = replace(fit, a90=None, reaches_90=False)
         return replace(without, a90_95=NO_BOUNDS, a90_95_two_sided=NO_BOUNDS, a90_low_two_sided=NO_BOUNDS)
 

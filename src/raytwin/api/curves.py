@@ -548,11 +548,16 @@ def _hit_curve(
 
 def _better_told(fit: "PodFit", best: "Alternative", *, widened: bool) -> str:
     """A warning that another curve fits far better; widened: bounds are those of all that fit."""
+    from ..pod.models import ends_below_90
+
+    better = f"another curve fits better: {best.name} (AIC lower by {(fit.aic or 0.0) - (best.aic or 0.0):.3g}"
+    if widened and ends_below_90(best):
+        return f"{better}); it ends below 90 %, so there is no a90"
     told = "none" if best.a90 is None else f"{best.a90:.4g}"
     bounds = (
         "bounds are those of all curves that fit" if widened else "bounds of all curves that fit stand in over_links"
     )
-    return f"another curve fits better: {best.name} (AIC lower by {(fit.aic or 0.0) - (best.aic or 0.0):.3g}, a90 {told}); {bounds}"
+    return f"{better}, a90 {told}); {bounds}"
 
 
 @contextmanager

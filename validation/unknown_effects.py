@@ -4,7 +4,7 @@ The effect acts after the calibrating series, in light or in numbers. The answer
 one of the same physics, which `accepted` names. Strengths are choices: each shows in the frames at a glance.
 
     python validation/unknown_effects.py
-    python validation/unknown_effects.py --cases smear,jpeg --seed 7 --keep build/unknown_effects
+    python validation/unknown_effects.py --cases smear,compressed --seed 7 --keep build/unknown_effects
 """
 
 import argparse

@@ -8,6 +8,7 @@ instead.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +108,7 @@ def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int
     readings: list[Reading] = []
     unusable: dict[str, str] = {}
     saturated: set[str] = set()
-    stops: dict[str, float] = {}  # where the numbers of saturated series end
+    stops: list[tuple[Series, float]] = []  # lit series without any correction whose numbers pile up at one, and that
     reached: dict[str, float] = {}  # what a share of the numbers of others exceed that bad pixels do not make up
     blank: dict[str, tuple[Reading, float]] = {}  # and the one number that all their pixels have
     for item in acquisition.series:
@@ -118,12 +119,14 @@ def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int
         frames = np.asarray(item.read_frames(first, item.n_frames)[:, ::stride, ::stride], dtype=np.float64)
         found = reading_of(item, frames, acquisition, since=item.name not in calibrating)
         full = 0.0 if item.kind in ("dark", "afterglow") else share_at_the_top(frames)
-        if float(np.ptp(frames)) == 0.0:
+        same = float(np.ptp(frames)) == 0.0
+        if (full > _SATURATED or (same and item.kind in ("flat", "object"))) and not item.corrected:
+            stops.append((item, float(frames.max())))
+        if same:
             blank[item.name] = found, float(frames.flat[0])
         elif full > _SATURATED:
             unusable[item.name] = f"saturated: {100 * full:.0f} % of the pixels stand at {frames.max():.0f} DN"
             saturated.add(item.name)
-            stops[item.name] = float(frames.max())
         else:
             readings.append(found)
             reached[item.name] = float(np.quantile(frames, 1.0 - _SATURATED))
@@ -141,18 +144,26 @@ def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int
     return readings, Plausibility(suspects=(), unusable=unusable, saturated=frozenset(saturated), stops=told)
 
 
-def _stops_text(stops: Mapping[str, float], reached: Mapping[str, float]) -> str:
-    """What is said of series whose numbers stop at one that another exceeds; empty where none does.
+def _stops_text(stops: Sequence[tuple[Series, float]], reached: Mapping[str, float]) -> str:
+    """What is said of series whose numbers stop at one that another series exceeds; empty where none do.
 
-    A converter's end is the same in all frames: what stops below it was cut off by something else.
+    A converter ends at one number in all frames: what stops below it was cut off by something else. Numbers of one beam alone may
+    also pile up where codes are coarse; where those of two beams stop at the same one, they are cut off.
+
+    Args:
+        stops: series and the number at which theirs pile up.
+        reached: by name, what a share of the numbers of a series exceed.
     """
+    beams: dict[float, set[tuple[Any, ...]]] = {}
+    for item, top in stops:
+        beams.setdefault(top, set()).add((item.kV, item.filters, item.exposure_ms, item.current_mA, item.power_W))
     brightest = max(reached, key=lambda name: reached[name], default="")
-    early = [name for name, top in stops.items() if brightest and top < reached[brightest]]
+    early = [(item.name, top) for item, top in stops if len(beams[top]) > 1 and brightest and top < reached[brightest]]
     if not early:
         return ""
     more = f" and {len(early) - 1} more" if len(early) > 1 else ""
     return (
-        f"numbers of {early[0]}{more} stop at {stops[early[0]]:.0f} DN, those of {brightest} go on to {reached[brightest]:.0f} DN:"
+        f"numbers of {early[0][0]}{more} stop at {early[0][1]:.0f} DN, those of {brightest} go on to {reached[brightest]:.0f} DN:"
         " something cuts them off that was not there always"
     )
 

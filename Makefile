@@ -6,7 +6,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-ROOMS := acquisition calibration campaign diagnosis generator lab materials observers pod reports segmentation spectra
+ROOMS := acquisition calibration campaign checks diagnosis generator lab materials observers pod reports segmentation spectra
 READY := $(VENV)/.ready
 
 .PHONY: demo table discrepancy docs wheel-check bounds-check lock stories test test-slow test-gpu test-page validation validation-input validation-generator validation-prediction validation-simulators starter blind-check benchmark benchmark-memory check format clean

@@ -8,6 +8,7 @@ Files:
     pairs                 dark and flat correction, pairs by scene
     contrast              contrast of a foreign object in a pair
     sessions              several sessions as one; one layer of a dual-layer panel
+    series_roles          which series of a session calibrate
     coarser               squares of pixels as pixels
     log_images            frames of I/I0 or its logarithm as light
     cut_off               frames that end at 0

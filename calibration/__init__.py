@@ -25,12 +25,8 @@ Files:
     transmission_table    transmission tables
     validate              predictions against measured flats and wedges
     next_measurement      the measurement that would narrow predictions most
-    check                 what measurements allow, and what is suspicious
-    findings              codes and sentences of a check
-    series_scan           what a check asks of one series' frames
     frame_checks          copies of frames, change of scene
-    frame_signs           signs of processing
-    label_checks          labels that do not fit the frames
+    code_steps            distance of the ADC's codes
     _measured_table       CSV tables
     _kept_sums            sums of many series, on disk where they are large
     _kernels              compiled loops
@@ -45,15 +41,6 @@ if TYPE_CHECKING:
     from .calibrate import (
         calibrate_twin,
         calibration_answer,
-    )
-    from .check import (
-        CheckResult,
-        check_acquisition,
-    )
-    from .findings import (
-        Finding,
-        FindingCode,
-        Severity,
     )
     from .flat_levels import (
         SeriesPoint,
@@ -103,11 +90,6 @@ if TYPE_CHECKING:
     )
 
 _LAZY = {
-    "CheckResult": "check",
-    "check_acquisition": "check",
-    "Finding": "findings",
-    "FindingCode": "findings",
-    "Severity": "findings",
     "SceneCheck": "frame_checks",
     "repeated_frame_indices": "frame_checks",
     "same_scene": "frame_checks",
@@ -140,9 +122,6 @@ _LAZY = {
 
 __all__ = [
     "PRIORS",
-    "CheckResult",
-    "Finding",
-    "FindingCode",
     "FrameSums",
     "NextMeasurement",
     "NoisePower",
@@ -150,7 +129,6 @@ __all__ = [
     "Prior",
     "SceneCheck",
     "SeriesPoint",
-    "Severity",
     "SpectralFit",
     "SpreadFit",
     "Validation",
@@ -158,7 +136,6 @@ __all__ = [
     "advice",
     "calibrate_twin",
     "calibration_answer",
-    "check_acquisition",
     "compute_difference_power",
     "compute_noise_power",
     "compute_photon_transfer",

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import Series
 from ..generator.line.twin import BAD_PIXEL_CODES
 from ._kept_sums import KeptSums
+from .code_steps import least_change
 from .dark_frames import DarkFrames
-from .frame_signs import least_change
 
 _DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot
 _DEAD = 0.5  # share of its neighbours' response below which a pixel is dead

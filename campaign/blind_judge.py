@@ -67,10 +67,10 @@ def judge_session(
     import numpy as np
 
     from ..acquisition import open_acquisition
-    from ..diagnosis.checks.preparation import prepare_session
     from ..diagnosis.diagnose_session import diagnose
     from ..diagnosis.judgement.answer import diagnosis_answer
     from ..diagnosis.problem.assemble import problem_of
+    from ..diagnosis.session.preparation import prepare_session
     from .blind_code import code_digest
     from .blind_second_day import second_day_shrinkage
     from .blind_statistics import session_features, session_statistics, write_statistics

@@ -7,15 +7,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..acquisition.acquisition_io import AcquisitionFile
+from ..checks.findings import Finding
 from ..errors import InputError
 from ..generator.line.twin import Twin
-from .checks.preparation import calibrated_twin, mislabelled, prepare_session, suspects_left
-from .checks.readings import Suspect
-from .inference.inference import UNKNOWN, Hypothesis
 from .judgement.answer import Diagnosis, in_pixels
 from .judgement.judgement import judge
 from .problem.assemble import problem_of
 from .session.coarse import unseen_in_squares
+from .session.preparation import calibrated_twin, findings_left, mislabelled, prepare_session
 
 
 def diagnose(
@@ -52,26 +51,32 @@ def _diagnosed(
     without: Sequence[str],
     progress: Callable[[str], None] | None,
 ) -> Diagnosis:
-    session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
-    unseen = unseen_in_squares() if session.factor > 1 else {}
-    try:
-        problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
-        result = judge(problem, session.twin, rng=rng, progress=progress)
-    except InputError as error:
-        if session.suspects:
-            raise mislabelled(acquisition, session.suspects) from error
-        raise
-    result = replace(result, warnings=(*session.left_out, *result.warnings), notes=(*session.notes, *result.notes))
-    suspects = session.suspects
-    if suspects and result.added:
-        suspects = suspects_left(session, problem.explained_by(result.added))
-    if suspects:
-        result = _doubted(result, session.twin, suspects)
-    elif session.suspects:
-        cleared = (f"{item.text}; what was found makes it look so" for item in session.suspects)
-        result = replace(result, notes=(*result.notes, *cleared))
-    if session.stops:
-        result = _cut_off(result, session.stops)
+    """The series whose frames do not contradict their labels, or do so by what is found, and what contradicts them."""
+    wrong: tuple[Finding, ...] = ()
+    while True:
+        session = prepare_session(acquisition, twin=twin, rng=rng, contradicted=wrong, progress=progress)
+        unseen = unseen_in_squares() if session.factor > 1 else {}
+        left = session.findings
+        try:
+            problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
+            result = judge(problem, session.twin, rng=rng, progress=progress)
+        except InputError as error:
+            if not left and session.contradicted:
+                raise mislabelled(acquisition, session.contradicted) from error
+            if not left:
+                raise
+        else:
+            if left and result.added:
+                left = findings_left(session, problem.explained_by(result.added))
+            if not left:
+                break
+        wrong = (*session.contradicted, *left)
+    cleared = (f"{item.line}; what was found makes it look so" for item in session.findings)
+    result = replace(
+        _with_findings(result, (*session.contradicted, *session.other_findings)),
+        warnings=(*session.left_out, *result.warnings),
+        notes=(*session.notes, *result.notes, *cleared),
+    )
     if session.factor == 1:
         return result
     if twin is None:
@@ -81,55 +86,9 @@ def _diagnosed(
     return in_pixels(result, twin=twin, factor=session.factor)
 
 
-def _cut_off(diagnosis: Diagnosis, stops: str) -> Diagnosis:
-    """The diagnosis of a session whose numbers stop early in some series: something is missing, whatever the others say."""
-    none = sum(item.probability for item in diagnosis.hypotheses if not item.effects)
-    hypotheses = [
-        replace(
-            item,
-            probability=item.probability + none
-            if item.effects == (UNKNOWN,)
-            else item.probability * bool(item.effects),
-        )
-        for item in diagnosis.hypotheses
-    ]
-    words = {"no_gap": "unknown_effect", "explained": "explained_in_part"}
-    return replace(
-        diagnosis,
-        verdict=words.get(diagnosis.verdict, diagnosis.verdict),
-        hypotheses=tuple(sorted(hypotheses, key=lambda item: -item.probability)),
-        probability_no_gap=0.0,
-        probability_unknown=diagnosis.probability_unknown + none,
-        unknown_location="level of the saturated series"
-        if diagnosis.verdict == "no_gap"
-        else diagnosis.unknown_location,
-        notes=(stops, *diagnosis.notes),
-    )
-
-
-def _doubted(diagnosis: Diagnosis, twin: Twin, suspects: tuple[Suspect, ...]) -> Diagnosis:
-    """The diagnosis of a session whose labels look wrong: no effect is named, whatever the frames would say under them."""
-    known = {item.effects for item in diagnosis.hypotheses}
-    hypotheses = [
-        replace(item, probability=1.0 if item.effects == (UNKNOWN,) else 0.0) for item in diagnosis.hypotheses
-    ]
-    if (UNKNOWN,) not in known:
-        hypotheses.append(Hypothesis(effects=(UNKNOWN,), probability=1.0, log_evidence=0.0))
-    return replace(
-        diagnosis,
-        verdict="unknown_effect",
-        hypotheses=tuple(sorted(hypotheses, key=lambda item: -item.probability)),
-        causes=(),
-        probability_no_gap=0.0,
-        probability_unknown=1.0,
-        unknown_location="labels of the series",
-        gap=replace(diagnosis.gap, after=diagnosis.gap.before, shrinks_by=None),
-        held_out=tuple((axis, before, before, floor) for axis, before, _, floor in diagnosis.held_out),
-        ambiguous_with=(),
-        next_measurement=None,
-        twin=twin,
-        added=(),
-        named=(),
-        warnings=(*(item.text for item in suspects), *diagnosis.warnings),
-        mislabelled=suspects,
-    )
+def _with_findings(diagnosis: Diagnosis, findings: tuple[Finding, ...]) -> Diagnosis:
+    """The diagnosis of a session in which some series contradict what they state: that the others have no gap is not all."""
+    if not findings or diagnosis.verdict != "no_gap":
+        return replace(diagnosis, findings=findings)
+    place = ", ".join(findings[0].names)
+    return replace(diagnosis, verdict="unknown_effect", unknown_location=place, findings=findings)

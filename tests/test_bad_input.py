@@ -339,7 +339,7 @@ def test_what_the_system_refuses_is_one_line_and_exit_2(files, capsys, monkeypat
     def refuse(*_, **__):
         raise refusal
 
-    monkeypatch.setattr("raytwin.calibration.check.check_acquisition", refuse)
+    monkeypatch.setattr("raytwin.checks.check.check_acquisition", refuse)
     assert main(["check", str(files["session"])]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""

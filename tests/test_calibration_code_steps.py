@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from raytwin.calibration.bad_pixels import find_bad_pixels
+from raytwin.calibration.code_steps import least_change
 from raytwin.calibration.dark_frames import DarkFrames
-from raytwin.calibration.frame_signs import least_change
 from raytwin.generator.line.twin import BAD_PIXEL_CODES
 
 SHAPE = (48, 48)

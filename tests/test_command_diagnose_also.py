@@ -5,10 +5,10 @@ import pytest
 
 from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
+from raytwin.acquisition.series_roles import calibrating_names
 from raytwin.acquisition.sessions import continued_session
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.cli import main
-from raytwin.diagnosis.session.session import calibrating_names
 
 
 def write(path, *, kinds, role="calibration", pixel_mm=0.4):

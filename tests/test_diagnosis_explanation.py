@@ -5,7 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from raytwin.diagnosis.diagnose_session import _cut_off
+from raytwin.checks.findings import Finding, FindingCode
+from raytwin.diagnosis.diagnose_session import _with_findings
 from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis
 from raytwin.diagnosis.judgement.answer import Cause, Diagnosis, Place
 from raytwin.diagnosis.judgement.held_out import Gap
@@ -45,7 +46,8 @@ def diagnosis(verdict, **more):
         ),
         "causes": (),
         "named": (),
-        "mislabelled": (),
+        "findings": (),
+        "no_gap_but_findings": False,
         "not_tested": {},
         "warnings": (),
         "strained": (),
@@ -137,14 +139,19 @@ def test_a_session_whose_numbers_stop_early_has_a_gap_whatever_the_rest_says():
     agreed = Diagnosis(
         verdict="no_gap", hypotheses=tuple(items), probability_no_gap=0.93, probability_unknown=0.02, **fields
     )
-    found = _cut_off(agreed, "numbers stop at 41151 DN")
-    assert (found.verdict, found.probability_no_gap) == ("unknown_effect", 0.0)
-    assert found.probability_unknown == pytest.approx(0.95)
-    assert {item.effects: item.probability for item in found.hypotheses} == pytest.approx(
-        {(UNKNOWN,): 0.95, ("image_lag",): 0.05, (): 0.0}
+    stops = Finding(
+        code=FindingCode.STOPS,
+        series="flat_1",
+        others=("flat_2",),
+        values={"top": 41151.0, "other": "flat_3", "reached": 50000.0},
     )
-    assert found.notes == ("numbers stop at 41151 DN",)
-    assert _cut_off(replace(agreed, verdict="explained"), "numbers stop").verdict == "explained_in_part"
+    found = _with_findings(agreed, (stops,))
+    assert (found.verdict, found.unknown_location) == ("unknown_effect", "flat_1, flat_2")
+    assert found.no_gap_but_findings
+    # probabilities are of the series that were compared
+    assert (found.hypotheses, found.probability_no_gap) == (agreed.hypotheses, 0.93)
+    assert _with_findings(replace(agreed, verdict="explained"), (stops,)).verdict == "explained"
+    assert _with_findings(agreed, ()) == agreed
 
 
 def test_a_tie_names_its_members_and_the_measurement_that_would_break_it():
@@ -161,6 +168,11 @@ def test_a_tie_names_its_members_and_the_measurement_that_would_break_it():
 
 def test_no_gap_says_how_sure_it_is_and_wrong_labels_come_before_everything():
     assert "probability 0.87 that nothing is missing" in paragraph(diagnosis("no_gap", probability_no_gap=0.87))
-    doubt = SimpleNamespace(text="flat_1 looks like 60 kV, not 90 kV")
-    text = paragraph(diagnosis("unknown_effect", mislabelled=(doubt,), warnings=("flat_1",)))
-    assert text.startswith("Labels look wrong: flat_1 looks like 60 kV, not 90 kV. No effect is named")
+    wrong = Finding(code=FindingCode.LABEL, series="flat_1", values={"what": "looks like 60 kV (labelled 90 kV)"})
+    text = paragraph(
+        diagnosis(
+            "unknown_effect", findings=(wrong,), no_gap_but_findings=True, probability_no_gap=0.87, warnings=("flat_1",)
+        )
+    )
+    assert text.startswith("Labels look wrong: flat_1: looks like 60 kV (labelled 90 kV)")
+    assert "The other series agree with the twin (probability 0.87 that nothing is missing in them)" in text

@@ -14,10 +14,10 @@ from raytwin.diagnosis.advice.next_series import (
     measurements_lacking,
     proposal_text,
 )
-from raytwin.diagnosis.checks.preparation import prepare_session
 from raytwin.diagnosis.diagnose_session import diagnose
 from raytwin.diagnosis.model.changes import catalogue_variants
 from raytwin.diagnosis.problem.assemble import build_problem
+from raytwin.diagnosis.session.preparation import prepare_session
 from raytwin.generator.effects import EFFECTS
 
 ALL = ("afterglow", "discs", "edges", "timed edges", "slabs", "wedge", "filter", "exposures", "turned")

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.api._given import as_twin
 from raytwin.calibration.priors import PRIORS
-from raytwin.diagnosis.checks.preparation import _taken_in
 from raytwin.diagnosis.model import changes as scales
 from raytwin.diagnosis.model.calibrated_maps import calibrated_maps
 from raytwin.diagnosis.model.changes import Change, catalogue_variants, departures_found, twin_changes
@@ -23,6 +22,7 @@ from raytwin.diagnosis.problem.nuisance_columns import nuisances_of_series
 from raytwin.diagnosis.problem.other_scenes import Redrawn
 from raytwin.diagnosis.problem.series_probes import variance_of_what_came
 from raytwin.diagnosis.session.even_maps import compact, full_size
+from raytwin.diagnosis.session.preparation import _taken_in
 from raytwin.errors import InputError
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.effects.misregistration import parts_px

@@ -29,7 +29,18 @@ BELOW = {
     "generator": {"acquisition", "materials", "spectra"},
     "observers": {"acquisition", "materials", "spectra", "generator", "pod"},
     "calibration": {"acquisition", "materials", "spectra", "generator"},
-    "diagnosis": {"acquisition", "materials", "spectra", "generator", "calibration", "segmentation", "pod", "reports"},
+    "checks": {"acquisition", "materials", "spectra", "generator", "calibration"},
+    "diagnosis": {
+        "acquisition",
+        "materials",
+        "spectra",
+        "generator",
+        "calibration",
+        "checks",
+        "segmentation",
+        "pod",
+        "reports",
+    },
 }
 SHIPPED = {
     "raytwin.data.calibration": "data/calibration",
@@ -281,7 +292,7 @@ def test_packages_import_in_the_order_of_the_architecture_page(room):
 def test_docstrings_of_packages_name_their_files():
     """Effects apart, whose files stand in a dict."""
     folders = [ROOT / folder for folder in subpackages_on_disk().values() if folder != "generator/effects"]
-    folders += [ROOT / room for room in ("acquisition", "calibration", "campaign", "observers", "spectra")]
+    folders += [ROOT / room for room in ("acquisition", "calibration", "campaign", "checks", "observers", "spectra")]
     for folder in folders:
         told = ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))) or ""
         files = {path.stem for path in folder.glob("*.py")} - {"__init__"}

@@ -30,8 +30,8 @@ from scipy.ndimage import gaussian_filter
 from raytwin.acquisition import write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import filters_from_text
-from raytwin.calibration.check import check_acquisition
-from raytwin.calibration.findings import FindingCode as F
+from raytwin.checks.check import check_acquisition
+from raytwin.checks.findings import FindingCode as F
 from raytwin.cli import main as raytwin
 
 SHAPE = (96, 128)
@@ -411,13 +411,13 @@ CASES: dict[str, Case] = {
         make=swap_frames(VICTIM, "dark_50"),
         also=(F.DARK_WITH_LIGHT,),
     ),
-    "wrong_current": Case(code=F.LOAD_LABEL, series=(VICTIM,), make=of_labels(VICTIM, current_mA=3.0)),
+    "wrong_current": Case(code=F.LABEL, series=(VICTIM,), make=of_labels(VICTIM, current_mA=3.0)),
     "wrong_exposure": Case(code=F.LOAD_LABEL, series=(VICTIM,), make=of_labels(VICTIM, exposure_ms=50.0)),
     "wrong_kV": Case(
-        code=F.LOAD_LABEL, series=("flat_90_Cu0.1_2mA_100ms",), make=of_labels("flat_90_Cu0.1_2mA_100ms", kV=40.0)
+        code=F.LABEL, series=("flat_90_Cu0.1_2mA_100ms",), make=of_labels("flat_90_Cu0.1_2mA_100ms", kV=40.0)
     ),
     "kV_of_two_beams_exchanged": Case(
-        code=F.KV_LABEL,
+        code=F.LABEL,
         series=tuple(
             f"flat_{kV}_open_{rest}" for kV in (40, 90) for rest in ("1mA_100ms", "2mA_100ms", "2mA_50ms", "4mA_100ms")
         ),
@@ -427,10 +427,9 @@ CASES: dict[str, Case] = {
             else one
             for one in session
         ],
-        also=(F.FILTER_LABEL,),
     ),
     "filter_left_out_of_the_label": Case(
-        code=F.LOAD_LABEL,
+        code=F.LABEL,
         series=("flat_40_Cu0.1_2mA_100ms",),
         make=of_labels("flat_40_Cu0.1_2mA_100ms", filters=()),
     ),

@@ -20,10 +20,10 @@ import numpy as np
 from learn_discrepancy import row_of
 
 from raytwin.acquisition import open_acquisition
-from raytwin.diagnosis.checks.preparation import prepare_session
 from raytwin.diagnosis.judgement.judgement import verdict_of
 from raytwin.diagnosis.judgement.strengths import strength_of
 from raytwin.diagnosis.problem.assemble import problem_of
+from raytwin.diagnosis.session.preparation import prepare_session
 from raytwin.generator.effects import EFFECTS
 from raytwin.generator.effects.effect import Reading
 from raytwin.lab import EffectRequest, run_protocol

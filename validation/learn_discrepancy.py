@@ -24,7 +24,6 @@ import numpy as np
 import second_simulator as plain
 
 from raytwin.acquisition import open_acquisition
-from raytwin.diagnosis.checks.preparation import prepare_session
 from raytwin.diagnosis.inference.curve_fits import CurveFit
 from raytwin.diagnosis.inference.discrepancy import LEVELS
 from raytwin.diagnosis.inference.inference import UNKNOWN, evidence_with_rest
@@ -32,6 +31,7 @@ from raytwin.diagnosis.inference.unknown import LOG_DENSITY
 from raytwin.diagnosis.judgement.judgement import Weighed, verdict_of, weigh_problem
 from raytwin.diagnosis.problem.assemble import problem_of
 from raytwin.diagnosis.problem.problem import Problem
+from raytwin.diagnosis.session.preparation import prepare_session
 
 _ROUNDS = 300
 _CLEAR = 3.0  # log evidence from which something is said

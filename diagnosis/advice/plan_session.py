@@ -11,9 +11,9 @@ from ...acquisition.acquisition_io import AcquisitionFile
 from ...generator.effects import EFFECTS
 from ...generator.line.twin import Twin
 from ...results import Result, Table, axes_or_new, frame, plain
-from ..checks.preparation import prepare_session
 from ..problem.assemble import problem_of
 from ..session.coarse import unseen_in_squares
+from ..session.preparation import prepare_session
 from .plan import Distinguishability, distinguishability
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class SessionPlan(Result):
         )
         notes = (
             *(f"{effect} cannot be judged: {reason}" for effect, reason in self.cannot_be_judged.items()),
-            *(f"label in doubt: {line}" for line in self.mislabelled),
+            *(f"finding: {line}" for line in self.mislabelled),
         )
         title = f"{len(rows)} effects that these series can show"
         return Table(title=title, header=("effect", "since", "seen from"), rows=rows, notes=notes)
@@ -117,5 +117,5 @@ def plan_session(
     return SessionPlan(
         distinguishability=replace(found, strengths=found.strengths * shares, seen_from=found.seen_from * shares),
         cannot_be_judged={**problem.missing_effects, **unseen},
-        mislabelled=tuple(item.text for item in session.suspects),
+        mislabelled=tuple(item.line for item in (*session.findings, *session.other_findings)),
     )

@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
+from ...checks.findings import Finding, FindingCode
 from ...errors import InputError
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.line.twin import Twin
 from ...results import Result, Table, axes_or_new, frame, plain
-from ..checks.readings import Suspect
 from ..inference.inference import Hypothesis
 from ..problem.known_effects import with_found
 from ..problem.problem import Problem
@@ -68,9 +68,10 @@ class Diagnosis(Result):
     """The answer; `named` are the effects of the leading hypothesis, `twin` is the twin with them added.
 
     notes: how the session was looked at, where that limits the answer. strained: nuisances that what is left pulls beyond
-    STRAINED_FROM of their standard deviations, and how far, the farthest first.
-    mislabelled: series whose labels look wrong; no effect is named then. not_tested: effects that these series could not
-    show, each with the reason. problem: what was compared, for reports; it takes no part in equality and is not pickled.
+    STRAINED_FROM of their standard deviations, and how far, the farthest first. findings: series whose frames contradict their
+    labels, and numbers that stop early; these series are left out, and all else is of the others. not_tested: effects that these
+    series could not show, each with the reason. problem: what was compared, for reports; it takes no part in equality and is not
+    pickled.
     inputs: hashes, version and seed; task: POD before and after, where that was asked for.
     """
 
@@ -91,7 +92,7 @@ class Diagnosis(Result):
     named: tuple[str, ...]
     problem: Problem | None = field(compare=False)
     warnings: tuple[str, ...] = ()
-    mislabelled: tuple[Suspect, ...] = ()
+    findings: tuple[Finding, ...] = ()
     not_tested: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     strained: tuple[tuple[str, float], ...] = ()
@@ -102,6 +103,11 @@ class Diagnosis(Result):
     def leading(self) -> tuple[Cause, ...]:
         """The causes that are named, most probable first."""
         return tuple(cause for cause in self.causes if cause.effect in self.named)
+
+    @property
+    def no_gap_but_findings(self) -> bool:
+        """Whether the series that could be compared agree with the twin, and others contradict what they state."""
+        return bool(self.findings) and not self.hypotheses[0].effects
 
     @property
     def compared(self) -> Problem:
@@ -163,6 +169,7 @@ class Diagnosis(Result):
         ]
         if self.next_measurement is not None and self.next_measurement.get("text"):
             notes.append(f"next: {self.next_measurement['text']}")
+        notes += [f"finding: {item.line}" for item in self.findings]
         notes += [f"note: {text}" for text in (*self.warnings, *self.notes)]
         gap = self.gap
         title = f"{self.verdict}: gap {gap.before:.3g} before, {gap.after:.3g} after, floor {gap.floor:.3g}"
@@ -285,7 +292,14 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any] | None =
         ],
         "not_tested": [{"effect": effect, "reason": reason} for effect, reason in diagnosis.not_tested.items()],
         "strained": [{"nuisance": name, "sd": value} for name, value in diagnosis.strained],
-        "mislabelled": [{"series": list(item.series), "text": item.text} for item in diagnosis.mislabelled],
+        "mislabelled": [
+            {"series": list(item.names), "text": item.line}
+            for item in diagnosis.findings
+            if item.code is not FindingCode.STOPS
+        ],
+        "findings": [
+            {"code": str(item.code), "series": list(item.names), "text": item.text} for item in diagnosis.findings
+        ],
         "task": None if diagnosis.task is None else dict(diagnosis.task),
         "warnings": [*diagnosis.warnings, *diagnosis.notes],
         "inputs": dict(diagnosis.inputs if inputs is None else inputs),

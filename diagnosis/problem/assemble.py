@@ -12,7 +12,6 @@ from ...errors import InputError
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.frames.conditions import beam_conditions, session_conditions, with_conditions
 from ...generator.line.twin import Twin
-from ..checks.preparation import PreparedSession
 from ..inference.discrepancy import FARTHEST_LEVEL, USUAL_LEVEL
 from ..inference.observed import Point
 from ..inference.unknown import Families
@@ -34,6 +33,7 @@ from ..model.placing import MeasuredScenes, place_scenes
 from ..model.responses import Asked, SeriesModel, SessionModel, session_model
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName
 from ..session.even_maps import Map
+from ..session.preparation import PreparedSession
 from ..session.session import SessionSeries, only_own_noise, read_session
 from ..session.summaries import SeriesSummary
 from ..session.usable import SeenSeries, counted_copies, look_at_all, stated_series, summarise_all

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...checks.readings import Explained
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.twin import Twin
-from ..checks.readings import Explained
 from ..inference.observed import Point
 from ..inference.seen import Blocks
 from ..inference.unknown import Families

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ...checks.findings import FindingCode
 from ...generator.effects import EFFECTS
 from ..inference.inference import UNKNOWN
 from ..judgement.answer import EXPLAINED, Cause, Diagnosis, Place
@@ -26,6 +27,10 @@ _AXIS_WORDS = {
     "position": "pattern across the field",
     "energy": "change with tube voltage",
     "tails": "outlying pixels and codes",
+}
+_FINDING_TITLES = {
+    FindingCode.STOPS: "Numbers are cut off early",
+    FindingCode.SPECTRUM: "The flats fit no spectrum",
 }
 
 
@@ -107,9 +112,8 @@ def compared_text(diagnosis: Diagnosis) -> str:
         kinds[view.session.series.kind] = kinds.get(view.session.series.kind, 0) + 1
     told = ", ".join(f"{number} of kind {kind}" for kind, number in kinds.items())
     text = f"{sum(kinds.values())} series were compared ({told})"
-    left_out = len(diagnosis.warnings) - len(diagnosis.mislabelled)
-    if left_out:
-        text += f", {left_out} could not be used"
+    if diagnosis.warnings:
+        text += f", {len(diagnosis.warnings)} could not be used"
     if diagnosis.not_tested:
         names = [title_of(effect) for effect in diagnosis.not_tested]
         shown = ", ".join(names[:_NAMED_UNTESTED]) + (" and others" if len(names) > _NAMED_UNTESTED else "")
@@ -128,14 +132,14 @@ def strained_text(diagnosis: Diagnosis) -> str:
 
 
 def paragraph(diagnosis: Diagnosis) -> str:
-    """Verdict, where, which, how far; labels in doubt come first, what the session could not show comes last."""
+    """Verdict, where, which, how far; findings come first, what the session could not show comes last."""
     text = verdict_text(diagnosis)
-    if diagnosis.mislabelled:
-        doubts = [item.text for item in diagnosis.mislabelled]
-        shown = "; ".join(doubts[:_NAMED])
-        more = f"; and {len(doubts) - _NAMED} more" if len(doubts) > _NAMED else ""
-        text = f"Labels look wrong: {shown}{more}. No effect is named until they are right or left out. {text}"
-    if diagnosis.not_tested or len(diagnosis.warnings) > len(diagnosis.mislabelled):
+    if diagnosis.findings:
+        lines = [item.line for item in diagnosis.findings]
+        shown = "; ".join(lines[:_NAMED])
+        more = f"; and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
+        text = f"{findings_title(diagnosis)}: {shown}{more}. All else is of the other series. {text}"
+    if diagnosis.not_tested or diagnosis.warnings:
         text += f" {compared_text(diagnosis)}"
     if diagnosis.strained and diagnosis.verdict not in EXPLAINED:
         text += f" {strained_text(diagnosis)}"
@@ -148,8 +152,11 @@ def verdict_text(diagnosis: Diagnosis) -> str:
     """Where, which and how far, without what the session could not show."""
     gap = diagnosis.gap
     figures = f"On data the fit did not see the gap is {gap.before:.2f} (1 is noise)"
-    if diagnosis.mislabelled:
-        return f"{_where_text(diagnosis.where)} {figures}."
+    if diagnosis.no_gap_but_findings:
+        return (
+            f"The other series agree with the twin (probability {diagnosis.probability_no_gap:.2f} that nothing is missing in"
+            f" them). {figures}."
+        )
     if diagnosis.verdict == "no_gap":
         return (
             f"The session agrees with its twin (probability {diagnosis.probability_no_gap:.2f} that nothing is missing). "
@@ -182,6 +189,11 @@ def verdict_text(diagnosis: Diagnosis) -> str:
     else:
         text += f" and {gap.after:.2f} after; it is too close to noise for a share to mean anything."
     return text + rest_text(diagnosis)
+
+
+def findings_title(diagnosis: Diagnosis) -> str:
+    """What is wrong with series that contradict themselves or each other, in a few words."""
+    return _FINDING_TITLES.get(diagnosis.findings[0].code, "Labels look wrong")
 
 
 def rivals(diagnosis: Diagnosis) -> list[tuple[str, float]]:

@@ -15,6 +15,7 @@ from .explanation import (
     axis_text,
     compared_text,
     fall_text,
+    findings_title,
     location_text,
     rest_text,
     rivals,
@@ -72,7 +73,7 @@ def write_report(
         headline=headline(diagnosis),
         paragraph=lead_text(diagnosis),
         whole_text=verdict_text(diagnosis),
-        doubts=[item.text for item in diagnosis.mislabelled],
+        doubts=[item.line for item in diagnosis.findings],
         key_figures=_key_figures(diagnosis),
         proof=[*names["map"][:first], "held_out"],
         maps=names["map"][first:],
@@ -94,7 +95,7 @@ def write_report(
         compared=compared_text(diagnosis),
         notes=diagnosis.notes,
         strained=strained_text(diagnosis),
-        skipped=diagnosis.warnings[len(diagnosis.mislabelled) :],
+        skipped=diagnosis.warnings,
         probes=len(diagnosis.compared.residual),
         nuisances=len(diagnosis.compared.factor_names),
         inputs=answer["inputs"],
@@ -103,8 +104,18 @@ def write_report(
 
 def headline(diagnosis: Diagnosis) -> str:
     """The answer in one line."""
-    if diagnosis.mislabelled:
-        return "Labels look wrong"
+    if diagnosis.no_gap_but_findings:
+        return findings_title(diagnosis)
+    found = _headline_of_verdict(diagnosis)
+    if not diagnosis.findings:
+        return found
+    title = findings_title(diagnosis)
+    # what makes labels look wrong may be that effect
+    return f"{found}. {title}, too" if diagnosis.verdict == "unknown_effect" else f"{title}. The other series: {found}"
+
+
+def _headline_of_verdict(diagnosis: Diagnosis) -> str:
+    """What explains the series that were compared."""
     if diagnosis.verdict == "no_gap":
         return "No gap: the session agrees with its twin"
     if diagnosis.verdict == "unknown_effect":
@@ -123,10 +134,11 @@ def _sentence(text: str) -> str:
 def lead_text(diagnosis: Diagnosis) -> str:
     """Where the gap is observed and what becomes of it, in two to four sentences."""
     gap = diagnosis.gap
-    if diagnosis.mislabelled:
-        first = diagnosis.mislabelled[0].text
-        told = f"{_sentence(first)}. " if len(diagnosis.mislabelled) == 1 else ""
-        return f"{told}No effect is named until these labels are right or the series are left out."
+    if diagnosis.findings:
+        count = len({name for item in diagnosis.findings for name in item.names})
+        told = f"{count} series contradict what they state"
+        told = diagnosis.findings[0].line if len(diagnosis.findings) == 1 else told
+        return f"{told}. All else is of the other series. {verdict_text(diagnosis)}"
     if not diagnosis.added or not diagnosis.where:
         return verdict_text(diagnosis)
     place = diagnosis.where[0]
@@ -147,13 +159,16 @@ def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
         if measure and measure.get("text")
         else []
     )
-    if diagnosis.mislabelled:
-        return [
+    if diagnosis.findings:
+        measured = [
             step(
-                "Check the labels named above against the log of the measurement, correct them in the sidecar and import again."
+                "Check the series named above against the log of the measurement, correct them in the sidecar and import again."
             ),
             step("Diagnose the session again.", "raytwin diagnose SESSION -o diagnosis"),
+            *measured,
         ]
+    if diagnosis.no_gap_but_findings:
+        return measured
     if diagnosis.verdict == "no_gap":
         return [
             step(
@@ -192,10 +207,11 @@ def _key_figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
         {"value": f"{cause.probability:.2f}", "text": f"probability of {title_of(cause.effect).lower()}"}
         for cause in diagnosis.leading
     ]
-    if diagnosis.mislabelled:
-        found = []
-    elif diagnosis.verdict == "no_gap":
-        found = [{"value": f"{diagnosis.probability_no_gap:.2f}", "text": "probability that nothing is missing"}]
+    if diagnosis.verdict == "no_gap" or diagnosis.no_gap_but_findings:
+        where = " in the other series" if diagnosis.findings else ""
+        found = [
+            {"value": f"{diagnosis.probability_no_gap:.2f}", "text": f"probability that nothing is missing{where}"}
+        ]
     elif diagnosis.verdict == "unknown_effect":
         found = [
             {"value": f"{diagnosis.probability_unknown:.2f}", "text": "probability of an effect outside the catalogue"}

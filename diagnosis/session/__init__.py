@@ -1,6 +1,7 @@
 """The measured session: its series, what their frames say in one pass, which of them can be compared.
 
 Files:
+    preparation   series that are left out, labels that frames contradict, the twin, where its spectrum is taken as linear
     session       which series calibrate, and what each asks of the forward model
     usable        which series can be compared, and the two passes over their frames
     summaries     statistics of the frames of one series

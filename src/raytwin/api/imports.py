@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas
 
     from ..acquisition.import_report import ImportReport, Skipped
-    from ..calibration.findings import Finding
+    from ..checks.findings import Finding
     from ..generator.line.twin import Twin
 
 # layout -> what it is; each has its module in `raytwin.acquisition`
@@ -149,7 +149,7 @@ def import_data(
     findings: tuple[Finding, ...] = ()
     if report.format == "acquisition":
         from ..acquisition import open_acquisition
-        from ..calibration.check import check_acquisition
+        from ..checks.check import check_acquisition
 
         findings = tuple(item for item in check_acquisition(report.written).findings if item.severity != "note")
         with open_acquisition(report.written) as acquisition:

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     import pandas
 
     from ..acquisition.acquisition_io import AcquisitionFile
-    from ..calibration.check import CheckResult
     from ..campaign.task import TaskInput, TaskPlan
+    from ..checks.check_result import CheckResult
     from ..diagnosis.advice.plan_session import SessionPlan
     from ..diagnosis.judgement.answer import Diagnosis
     from ..generator.line.twin import Twin
@@ -182,7 +182,8 @@ def check(source: "AcquisitionFile | PathLike", *, progress: Progress | bool | N
         0
     """
     from ..acquisition.acquisition_io import AcquisitionFile
-    from ..calibration.check import check_acquisition, check_series
+    from ..checks.check import check_acquisition
+    from ..checks.check_series import check_series
 
     with Telling(progress) as telling:
         if isinstance(source, AcquisitionFile):

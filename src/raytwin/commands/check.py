@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 from ._answer import answer, say
 
 if TYPE_CHECKING:
-    from ..calibration.check import CheckResult
-    from ..calibration.findings import Finding
+    from ..checks.check_result import CheckResult
+    from ..checks.findings import Finding
 
 EXAMPLE = """example:
   raytwin check session.h5

@@ -112,14 +112,15 @@ def run(arguments: argparse.Namespace) -> int:
         )
     if isinstance(found, SessionPlan):
         for line in found.mislabelled:
-            say(f"label in doubt: {line}")
+            say(f"finding: {line}")
         missing = [f"{effect} cannot be judged: {reason}" for effect, reason in found.cannot_be_judged.items()]
         text = "\n".join([table_text(found.distinguishability), *missing])
         answer(found.to_dict(), as_json=arguments.json, text=text)
         return 0
-    doubts = len(found.mislabelled)
-    for number, line in enumerate(found.warnings):
-        say(f"label in doubt: {line}" if number < doubts else f"not used: {line}")
+    for item in found.findings:
+        say(f"finding: {item.line}")
+    for line in found.warnings:
+        say(f"not used: {line}")
     for line in found.notes:
         say(line)
     text = paragraph(found)

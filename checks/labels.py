@@ -1,31 +1,28 @@
-"""Do the series of a session show what their labels say? Asked before effects compete.
+"""Do the series of a session show what their labels say? `check` tells it, and a diagnosis asks before effects compete.
 
-A kV, filter or exposure that belongs to another series (`label_suspects`), a dark that is a flat (`beam_suspects`), a thickness map
-of another object (`map_suspects`): no effect of the forward model is meant to explain these, and the nearest one would be named
-instead.
+A dark that is a flat, a flat that is a mean of frames (`beam_checks`), a thickness map of another object (`map_checks`), a kV, filter
+or exposure that belongs to another series (`relabelling`): no effect of the forward model is meant to explain these.
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...acquisition.acquisition_io import AcquisitionFile, Series
-from ...acquisition.log_images import holds_shares
-from ...errors import InputError
-from .beam_suspects import flats_without_beam, lit_darks, shadows_in_flats
+from ..acquisition.acquisition_io import AcquisitionFile, Series
+from ..acquisition.log_images import holds_shares
+from ..errors import InputError
+from .beam_checks import flats_without_beam, lit_darks, shadows_in_flats, undeclared_means
+from .findings import Finding, FindingCode
 from .label_model import LabelModel, spectral_model_of
-from .label_suspects import relabelled
-from .map_suspects import wrong_maps
+from .map_checks import wrong_maps
 from .readings import (
     FRAMES_READ,
     Explained,
     FloatArray,
     Reading,
-    Suspect,
     good_pixels,
     is_top,
     mean_of,
@@ -36,6 +33,7 @@ from .readings import (
     share_at_the_top,
     silent_darks,
 )
+from .relabelling import relabelled
 
 _PIXELS = 96  # a side that are looked at
 _SATURATED = 0.03  # share of the pixels at the top of the range; bad pixels alone are fewer
@@ -44,27 +42,27 @@ _REMEMBERED = 3  # exposures before
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plausibility:
+class LabelCheck:
     """What was found.
 
-    Fields: suspects, strongest first; unusable: series without any signal or noise, or saturated -> why; saturated: names of
-    those that were lit too much; stops: what is said where numbers stop at one that others of the session exceed, else empty.
+    Fields: findings: labels that the frames contradict; unusable: series without any signal or noise, or saturated -> why;
+    saturated: names of those that were lit too much; stops: series whose numbers stop at one that others of the session exceed.
     """
 
-    suspects: tuple[Suspect, ...]
+    findings: tuple[Finding, ...]
     unusable: Mapping[str, str]
     saturated: frozenset[str] = frozenset()
-    stops: str = ""
+    stops: tuple[Finding, ...] = ()
 
 
-def check_plausibility(
+def check_labels(
     acquisition: AcquisitionFile,
     *,
     calibrating: frozenset[str],
     dark_DN: Callable[[float | None], NDArray[np.floating]] | None = None,
     explained: Mapping[str, Explained] | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Plausibility:
+) -> LabelCheck:
     """Series of a session that do not show what their labels say.
 
     Args:
@@ -87,23 +85,25 @@ def check_plausibility(
     lit = [item for item in readings if item.series.kind in ("flat", "object")]
     refuse_fractions(lit)
     good = good_pixels(readings)
-    suspects = lit_darks(darks, lit, good, bits=acquisition.instrument.bits)
-    known = _Darks(readings=_less(darks, suspects), twins_DN=dark_DN, good=good, stride=stride)
+    shone_on = lit_darks(darks, lit, good, bits=acquisition.instrument.bits)
+    known = _Darks(readings=_less(darks, shone_on), twins_DN=dark_DN, good=good, stride=stride)
     dim, judged = flats_without_beam(_measured(lit, known), good)
     _flatten(judged, good)
     shadowed = shadows_in_flats(judged, good)
     judged = _less(judged, shadowed)
+    means = undeclared_means(judged, known.noise_DN2, good)
+    judged = _less(judged, means)
     try:
         model = spectral_model_of(acquisition, judged)
     except InputError:
         model = None  # a voltage or material that the spectral model does not reach: said where it belongs
     maps = LabelModel(acquisition, model, stride, good)
     misfits = wrong_maps(judged, maps)
-    suspects = [*suspects, *dim, *shadowed, *misfits, *relabelled(_less(judged, misfits), maps)]
-    return replace(found, suspects=tuple(sorted(suspects, key=lambda item: -item.evidence)))
+    wrong = (*shone_on, *dim, *shadowed, *means, *misfits, *relabelled(_less(judged, misfits), maps))
+    return replace(found, findings=wrong)
 
 
-def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int) -> tuple[list[Reading], Plausibility]:
+def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int) -> tuple[list[Reading], LabelCheck]:
     """Readings, at every `stride`th pixel and in order of time, and what cannot be used."""
     readings: list[Reading] = []
     unusable: dict[str, str] = {}
@@ -140,12 +140,12 @@ def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int
         if top and found.series.kind in ("flat", "object"):
             saturated.add(name)
     readings.sort(key=lambda item: item.series.index)
-    told = _stops_text(stops, reached)
-    return readings, Plausibility(suspects=(), unusable=unusable, saturated=frozenset(saturated), stops=told)
+    early = _stop_early(stops, reached)
+    return readings, LabelCheck(findings=(), unusable=unusable, saturated=frozenset(saturated), stops=early)
 
 
-def _stops_text(stops: Sequence[tuple[Series, float]], reached: Mapping[str, float]) -> str:
-    """What is said of series whose numbers stop at one that another series exceeds; empty where none do.
+def _stop_early(stops: Sequence[tuple[Series, float]], reached: Mapping[str, float]) -> tuple[Finding, ...]:
+    """Series whose numbers stop at one that another series exceeds, one finding for all that stop at the same.
 
     A converter ends at one number in all frames: what stops below it was cut off by something else. Numbers of one beam alone may
     also pile up where codes are coarse; where those of two beams stop at the same one, they are cut off.
@@ -154,29 +154,29 @@ def _stops_text(stops: Sequence[tuple[Series, float]], reached: Mapping[str, flo
         stops: series and the number at which theirs pile up.
         reached: by name, what a share of the numbers of a series exceed.
     """
-    beams: dict[float, set[tuple[Any, ...]]] = {}
+    at: dict[float, list[Series]] = {}
     for item, top in stops:
-        beams.setdefault(top, set()).add((item.kV, item.filters, item.exposure_ms, item.current_mA, item.power_W))
+        at.setdefault(top, []).append(item)
     brightest = max(reached, key=lambda name: reached[name], default="")
-    early = [(item.name, top) for item, top in stops if len(beams[top]) > 1 and brightest and top < reached[brightest]]
-    if not early:
-        return ""
-    more = f" and {len(early) - 1} more" if len(early) > 1 else ""
-    return (
-        f"numbers of {early[0][0]}{more} stop at {early[0][1]:.0f} DN, those of {brightest} go on to {reached[brightest]:.0f} DN:"
-        " something cuts them off that was not there always"
-    )
+    found = []
+    for top, members in at.items():
+        beams = {(one.kV, one.filters, one.exposure_ms, one.current_mA, one.power_W) for one in members}
+        if len(beams) > 1 and brightest and top < reached[brightest]:
+            first, *others = (one.name for one in members)
+            values = {"top": top, "other": brightest, "reached": reached[brightest]}
+            found.append(Finding(code=FindingCode.STOPS, series=first, others=tuple(others), values=values))
+    return tuple(found)
 
 
-def _less(readings: Sequence[Reading], suspects: Sequence[Suspect]) -> list[Reading]:
-    """Readings that no suspect names."""
-    blamed = {name for suspect in suspects for name in suspect.series}
+def _less(readings: Sequence[Reading], findings: Sequence[Finding]) -> list[Reading]:
+    """Readings that no finding names."""
+    blamed = {name for finding in findings for name in finding.names}
     return [item for item in readings if item.name not in blamed]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Darks:
-    """Dark frames of the session, or those of a twin where it has none (as in `check_plausibility`), at every `stride`th pixel."""
+    """Dark frames of the session, or those of a twin where it has none (as in `check_labels`), at every `stride`th pixel."""
 
     readings: list[Reading]
     twins_DN: Callable[[float | None], NDArray[np.floating]] | None

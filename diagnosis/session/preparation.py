@@ -1,4 +1,4 @@
-"""What happens to a session before its gap is looked for: series that cannot be used, labels in doubt, the twin."""
+"""What happens to a session before its gap is looked for: series that cannot be used, labels that frames contradict, the twin."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -10,48 +10,50 @@ from numpy.typing import NDArray
 from ...acquisition.acquisition_io import AcquisitionFile, Series
 from ...acquisition.coarser import coarser
 from ...acquisition.cut_off import share_of_zeros, without_cut_off_darks
+from ...acquisition.series_roles import calibrating_names
 from ...calibration.calibrate import calibrate_twin
 from ...calibration.repeated_frames import beam_of
+from ...checks.findings import Finding, FindingCode
+from ...checks.labels import LabelCheck, check_labels
+from ...checks.readings import Explained
 from ...errors import FitError, InputError, RaytwinError
 from ...generator.line.twin import Twin
-from ..session.coarse import LEAST_SIDE, coarse_factor
-from ..session.coarse_twin import twin_in_squares
-from ..session.origin import made_of
-from ..session.session import calibrating_names
-from .plausibility import Plausibility, check_plausibility
-from .readings import Explained, Suspect
+from .coarse import LEAST_SIDE, coarse_factor
+from .coarse_twin import twin_in_squares
+from .origin import made_of
 
 _OF_THIS_SESSION = (
     "the twin was calibrated from series of this session: the first of each kind and setting, or those whose role says so, count"
     " as its calibration, and the others are compared with it"
 )
+_CONTRADICTED = "its frames contradict what it states"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreparedSession:
     """A session ready for its diagnosis.
 
-    Fields: acquisition (less the series that cannot be used); exposed (of these, saturated series: what they left in the panel is
-    known); twin; calibrated_elsewhere (the twin was given, and none of these series is in it); suspects (series whose labels look
-    wrong); left_out (series that are not used, each with the reason); notes (how the session is looked at, and what calibration took
-    in); factor (pixels along each side of the squares that acquisition and twin have as pixels); all_pixels (the same series with all
-    pixels);
-    ends_at_zero (names of lit series whose numbers go down to 0 and not below); stops (what is said of series whose numbers stop
-    below those of others; empty: none does); spectral_point (parameter,): where the twin's spectral nuisances are taken as linear
-    (None: at its best parameters).
+    Fields: acquisition (less the series that cannot be used); exposed (of these, lit ones: what they left in the panel is known);
+    twin; calibrated_elsewhere (the twin was given, and none of these series is in it); contradicted (labels that frames contradict,
+    whose series are left out); findings (labels that frames contradict, whose series are not); other_findings (numbers that stop
+    early, flats that fit no spectrum); left_out (series that are not used, each with the reason); notes (how the session is looked
+    at, and what calibration took in); factor (pixels along each side of the squares that acquisition and twin have as pixels);
+    all_pixels (the same series with all pixels); ends_at_zero (names of lit series whose numbers go down to 0 and not below);
+    spectral_point (parameter,): where the twin's spectral nuisances are taken as linear (None: at its best parameters).
     """
 
     acquisition: AcquisitionFile
     exposed: tuple[Series, ...]
     twin: Twin
     calibrated_elsewhere: bool
-    suspects: tuple[Suspect, ...]
+    contradicted: tuple[Finding, ...]
+    findings: tuple[Finding, ...]
+    other_findings: tuple[Finding, ...]
     left_out: tuple[str, ...]
     notes: tuple[str, ...]
     factor: int
     all_pixels: AcquisitionFile
     ends_at_zero: frozenset[str]
-    stops: str
     spectral_point: NDArray[np.float64] | None
 
 
@@ -70,55 +72,77 @@ def prepare_session(
     *,
     twin: Twin | None,
     rng: np.random.Generator,
+    contradicted: tuple[Finding, ...] = (),
     progress: Callable[[str], None] | None = None,
 ) -> PreparedSession:
     """Check a session's labels, take out what cannot be used, and calibrate its twin where none was given.
 
-    Frames of more than LARGEST_PIXELS become means of squares of pixels, and a given twin that of such squares.
+    Frames of more than LARGEST_PIXELS become means of squares of pixels, and a given twin that of such squares. Where series whose
+    labels are contradicted cannot calibrate, they are left out.
+
+    Args:
+        acquisition: open file.
+        twin: calibrated elsewhere; None: the session's own series make it.
+        rng: source of randomness.
+        contradicted: labels that frames contradict, whose series are left out.
+        progress: called with the name of each stage.
 
     Raises:
         InputError: nothing can be calibrated or compared; the message says what is missing and what would do.
     """
     tell = progress or (lambda stage: None)
+    measured, given = acquisition, twin
     all_pixels, left_out = _of_one_shape(acquisition, twin)
     all_pixels, cut_off = without_cut_off_darks(all_pixels)
     left_out += cut_off
+    wrong = {name for item in contradicted for name in item.names}
+    left_out += [f"{item.name}: {_CONTRADICTED}" for item in all_pixels.series if item.name in wrong]
+    every = all_pixels.series
+    all_pixels = replace(all_pixels, series=tuple(item for item in every if item.name not in wrong))
     if not all_pixels.series:
-        raise _nothing_left(acquisition, left_out)
+        raise _nothing_left(acquisition, left_out, contradicted)
     factor = coarse_factor(all_pixels.series[0].shape)
     twin = None if twin is None else twin_in_squares(twin, factor)
     acquisition = coarser(all_pixels, factor)
-    found = _plausibility(acquisition, twin, progress=progress)
+    found = _checked_labels(acquisition, twin, progress=progress)
     left_out += [f"{name}: {reason}" for name, reason in found.unusable.items()]
     kept = tuple(item for item in acquisition.series if item.name not in found.unusable)
     if not kept:
-        raise _nothing_left(acquisition, left_out)
-    exposed = tuple(item for item in acquisition.series if item.name in found.saturated)
+        raise _nothing_left(acquisition, left_out, contradicted)
+    exposed = tuple(
+        item
+        for item in every
+        if item.name in found.saturated or (item.name in wrong and item.kind in ("flat", "object"))
+    )
     acquisition = replace(acquisition, series=kept)
     elsewhere = twin is not None and not made_of(twin, kept)
     notes: tuple[str, ...] = () if elsewhere or twin is None else (_OF_THIS_SESSION,)
-    suspects = found.suspects
+    other_findings = found.stops
     if twin is None:
         tell("calibration")
         try:
             twin = calibrated_twin(acquisition, rng=rng, progress=progress)
         except (InputError, FitError) as error:
-            raise _not_calibrated(acquisition, suspects, left_out, error) from error
-        suspects = suspects or _without_spectrum(acquisition, twin)
+            if found.findings:
+                wrong_labels = (*contradicted, *found.findings)
+                return prepare_session(measured, twin=given, rng=rng, contradicted=wrong_labels, progress=progress)
+            raise _not_calibrated(acquisition, contradicted, left_out, error) from error
+        other_findings += _without_spectrum(acquisition, twin)
         notes += _taken_in(twin, factor)
     return PreparedSession(
         acquisition=acquisition,
         exposed=exposed,
         twin=twin,
         calibrated_elsewhere=elsewhere,
-        suspects=suspects,
+        contradicted=contradicted,
+        findings=found.findings,
+        other_findings=other_findings,
         left_out=tuple(left_out),
         notes=notes,
         factor=factor,
         ends_at_zero=frozenset(
             item.name for item in all_pixels.series if item.kind in ("flat", "object") and share_of_zeros(item) > 0.0
         ),
-        stops=found.stops,
         spectral_point=_spectral_point(acquisition, twin, rng=rng, progress=progress),
         all_pixels=replace(
             all_pixels, series=tuple(item for item in all_pixels.series if item.name not in found.unusable)
@@ -140,15 +164,15 @@ def _taken_in(twin: Twin, factor: int) -> tuple[str, ...]:
     )
 
 
-def _plausibility(
+def _checked_labels(
     acquisition: AcquisitionFile,
     twin: Twin | None,
     *,
     explained: Mapping[str, Explained] | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Plausibility:
+) -> LabelCheck:
     """Labels of a session's series; twin: one from elsewhere, whose darks stand in for those that are not there."""
-    return check_plausibility(
+    return check_labels(
         acquisition,
         calibrating=calibrating_names(acquisition.series),
         dark_DN=None if twin is None else twin.maps.dark_at,
@@ -157,13 +181,12 @@ def _plausibility(
     )
 
 
-def suspects_left(session: PreparedSession, explained: Mapping[str, Explained]) -> tuple[Suspect, ...]:
-    """Those of the session's suspects whose series look mislabelled still once what an explanation does is taken off the frames."""
+def findings_left(session: PreparedSession, explained: Mapping[str, Explained]) -> tuple[Finding, ...]:
+    """The session's findings on labels that stand once what an explanation does is subtracted from the frames."""
     given = session.twin if session.calibrated_elsewhere else None
-    again = _plausibility(session.acquisition, given, explained=explained).suspects
-    again = again or _without_spectrum(session.acquisition, session.twin)
-    blamed = {name for item in again for name in item.series}
-    return tuple(item for item in session.suspects if not blamed.isdisjoint(item.series))
+    again = _checked_labels(session.acquisition, given, explained=explained).findings
+    blamed = {name for item in again for name in item.names}
+    return tuple(item for item in session.findings if not blamed.isdisjoint(item.names))
 
 
 def _spectral_point(
@@ -203,17 +226,17 @@ def _spectral_point(
     return np.array([values.get(name, value) for name, value in best])
 
 
-def mislabelled(acquisition: AcquisitionFile, suspects: tuple[Suspect, ...]) -> InputError:
+def mislabelled(acquisition: AcquisitionFile, contradicted: Sequence[Finding]) -> InputError:
     """The error for a session that cannot be worked with because of its labels."""
     return InputError(
         f"acquisition {acquisition.path}",
-        received="; ".join(item.text for item in suspects),
+        received="; ".join(item.line for item in contradicted),
         expected="labels that the frames agree with",
         remedy="correct the labels of these series, or leave them out",
     )
 
 
-def _without_spectrum(acquisition: AcquisitionFile, twin: Twin) -> tuple[Suspect, ...]:
+def _without_spectrum(acquisition: AcquisitionFile, twin: Twin) -> tuple[Finding, ...]:
     """Flats that state kV and tube load, and yet fit no spectrum."""
     names = calibrating_names(acquisition.series)
     stated = [
@@ -224,13 +247,8 @@ def _without_spectrum(acquisition: AcquisitionFile, twin: Twin) -> tuple[Suspect
     if twin.spectral is not None or not stated:
         return ()
     reason = next((line for line in twin.warnings if line.startswith("no spectral part")), "no spectral part")
-    return (
-        Suspect(
-            series=tuple(stated),
-            text=f"levels and noise of the flats fit no tube and scintillator at the kV, filters and load they state ({reason})",
-            evidence=0.0,
-        ),
-    )
+    first, *others = stated
+    return (Finding(code=FindingCode.SPECTRUM, series=first, others=tuple(others), values={"what": reason}),)
 
 
 def _of_one_shape(acquisition: AcquisitionFile, twin: Twin | None) -> tuple[AcquisitionFile, list[str]]:
@@ -271,18 +289,20 @@ def _of_one_shape(acquisition: AcquisitionFile, twin: Twin | None) -> tuple[Acqu
     return replace(acquisition, series=kept), left_out
 
 
-def _nothing_left(acquisition: AcquisitionFile, left_out: Sequence[str]) -> InputError:
+def _nothing_left(acquisition: AcquisitionFile, left_out: Sequence[str], contradicted: Sequence[Finding]) -> InputError:
+    if contradicted:
+        return mislabelled(acquisition, contradicted)
     return InputError(
         f"acquisition {acquisition.path}", received="; ".join(left_out), expected="series with light and noise"
     )
 
 
 def _not_calibrated(
-    acquisition: AcquisitionFile, suspects: tuple[Suspect, ...], left_out: Sequence[str], error: RaytwinError
+    acquisition: AcquisitionFile, contradicted: Sequence[Finding], left_out: Sequence[str], error: RaytwinError
 ) -> InputError:
     """Why a session cannot calibrate its own twin, and what could be said with one from elsewhere."""
-    if suspects:
-        return mislabelled(acquisition, suspects)
+    if contradicted:
+        return mislabelled(acquisition, contradicted)
     counted = Counter(item.kind for item in acquisition.series)
     several = sum(item.n_frames > 1 for item in acquisition.series)
     have = ", ".join(f"{number} {kind}" for kind, number in counted.items())

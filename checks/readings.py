@@ -7,27 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...acquisition.acquisition_io import AcquisitionFile, Series
-from ...acquisition.setting import Filter
-from ...calibration.frame_checks import repeats_the_last
-from ...errors import InputError
+from ..acquisition.acquisition_io import AcquisitionFile, Series
+from ..acquisition.setting import Filter
+from ..calibration.frame_checks import repeats_the_last
+from ..errors import InputError
 
 FloatArray = NDArray[np.float64]
 FRAMES_READ = 8  # read of each series
 _FRAMES_OF_NOISE = 5  # that an object's series needs to say something of noise
 _LEAST_BRIGHTEST_DN = 30.0  # of frames that are no whole numbers; 8 bits averaged have more, transmissions 1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Suspect:
-    """Series whose frames contradict a label.
-
-    Fields: series: their names; text: what they look like; evidence (natural logarithm).
-    """
-
-    series: tuple[str, ...]
-    text: str
-    evidence: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

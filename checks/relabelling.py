@@ -24,9 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...acquisition.setting import text_from_filters
+from ..acquisition.setting import text_from_filters
+from .findings import Finding, FindingCode
 from .label_model import DEEPEST, LabelModel, measured_depth, open_field
-from .readings import FloatArray, Label, Reading, Suspect
+from .readings import FloatArray, Label, Reading
 
 LEAST_EVIDENCE = 10.0
 _CONSTANT_SD, _OWN_BEAM_SD = 10.0, 3.0  # of the common level; of a beam of unknown kV or load
@@ -35,10 +36,12 @@ _LEVEL_SDS = {"voltage": 0.2, "beam": 0.05, "filters": 0.15, "series": 0.04}
 _GAIN_SDS = {"since": 0.35, "beam": 0.08}
 _ATTENUATION_SDS = {"all": 0.1, "placement": 0.3, "series": 0.12}
 _OBJECT_EXTRA = 0.05  # of level and noise behind an object
-_SUSPECT_Z = 3.5
-_MOST_SUSPECTS = 10
+_DOUBTFUL_Z = 3.5
+_MOST_DOUBTFUL = 10
 _PRICE_OF_A_SETTING = 2.0  # natural logarithm, of more than one word being wrong
 _MOST_CHANGES = 4
+_MOST_TOLD = 3  # labels that fit into a line
+_AS_LIKELY = 2.0  # natural logarithm, by which another label of the same series may be less likely and is told too
 # what a finding says is wrong, and the fields of a label that hold it
 _THINGS: dict[str, tuple[str, ...]] = {
     "tube voltage": ("kV",),
@@ -48,10 +51,25 @@ _THINGS: dict[str, tuple[str, ...]] = {
     "setting": ("kV", "load", "exposure_ms", "filters"),
 }
 _Covariance = Callable[[Sequence[int], Sequence[Label]], FloatArray]
-_Candidate = tuple[float, list[Label], tuple[int, ...], str]  # price, labelling, series it changes, in words
 
 
-def relabelled(judged: Sequence[Reading], maps: LabelModel) -> list[Suspect]:
+@dataclass(frozen=True, slots=True)
+class _Relabelling:
+    """Other labels for some series.
+
+    Fields: price (natural logarithm); labels, of all series; members: numbers of those that change; says: the sentence's beginning;
+    seen: what they look like; stated: the label of a single one.
+    """
+
+    price: float
+    labels: Sequence[Label]
+    members: tuple[int, ...]
+    says: str
+    seen: str
+    stated: str = ""
+
+
+def relabelled(judged: Sequence[Reading], maps: LabelModel) -> list[Finding]:
     """Series that fit far better with a label of other series; the likeliest change first, then the next on top of it."""
     features = _features(judged, maps)
     labels = [item.label for item in judged]
@@ -60,7 +78,7 @@ def relabelled(judged: Sequence[Reading], maps: LabelModel) -> list[Suspect]:
     def evidence(candidate: Sequence[Label]) -> float:
         return sum(feature.log_evidence(candidate) for feature in features)
 
-    found: list[Suspect] = []
+    found: list[Finding] = []
     if not features:
         return found
     current = evidence(labels)
@@ -69,14 +87,27 @@ def relabelled(judged: Sequence[Reading], maps: LabelModel) -> list[Suspect]:
         for feature in features:
             for index, z in feature.left_out(labels).items():
                 strange[index] = max(strange.get(index, 0.0), z)
-        suspects = sorted((i for i, z in strange.items() if z > _SUSPECT_Z), key=lambda i: -strange[i])[:_MOST_SUSPECTS]
-        candidates = [*_exchanged_groups(labels, names, kinds), *_candidates(suspects, labels, names)]
-        gains = [evidence(candidate) - current - price for price, candidate, _, _ in candidates]
+        doubtful = sorted((i for i, z in strange.items() if z > _DOUBTFUL_Z), key=lambda i: -strange[i])[
+            :_MOST_DOUBTFUL
+        ]
+        candidates = [*_exchanged_groups(labels, kinds), *_candidates(doubtful, labels, names)]
+        gains = [evidence(candidate.labels) - current - candidate.price for candidate in candidates]
         best = max(gains, default=0.0)
         if not best > LEAST_EVIDENCE:
             break
-        _, labels, members, text = candidates[gains.index(best)]
-        found.append(Suspect(series=tuple(names[index] for index in members), text=text, evidence=best))
+        chosen = candidates[gains.index(best)]
+        alike = [
+            one
+            for one, gain in zip(candidates, gains, strict=True)
+            if (one.members, one.says) == (chosen.members, chosen.says) and gain > best - _AS_LIKELY
+        ]
+        first, *others = (names[index] for index in chosen.members)
+        seen = tuple(dict.fromkeys(one.seen for one in alike))[:_MOST_TOLD]
+        stated = max((one.stated for one in alike), key=len)  # of a whole setting, where that is among them
+        labelled = f" (labelled {stated})" if stated else ""
+        what = f"{chosen.says} {' or '.join(seen)}{labelled}"
+        found.append(Finding(code=FindingCode.LABEL, series=first, others=tuple(others), values={"what": what}))
+        labels = list(chosen.labels)
         current = evidence(labels)
     return found
 
@@ -217,55 +248,61 @@ def _attenuations(judged: Sequence[Reading], maps: LabelModel) -> tuple[_Numbers
     return found, pixels
 
 
-def _exchanged_groups(labels: Sequence[Label], names: Sequence[str], kinds: Sequence[str]) -> list[_Candidate]:
-    """Labellings in which two tube voltages are exchanged in all flats, all objects or both."""
+def _exchanged_groups(labels: Sequence[Label], kinds: Sequence[str]) -> list[_Relabelling]:
+    """Labellings in which two tube voltages are exchanged in all flats, all objects or both, or in all flats behind one filter."""
     voltages = sorted({label.kV for label in labels if label.kV is not None})
-    groups = {"all flats": ("flat",), "all objects": ("object",), "all series": ("flat", "object")}
-    result: list[_Candidate] = []
+    stacks = [text_from_filters(label.filters) for label in labels]
+    groups: dict[str, list[int]] = {
+        title: [index for index, kind in enumerate(kinds) if kind in group]
+        for title, group in (("all flats", ("flat",)), ("all objects", ("object",)))
+    }
+    if all(groups.values()):
+        groups["all series"] = sorted(index for group in groups.values() for index in group)
+    behind = {
+        stack: [index for index in groups["all flats"] if stacks[index] == stack] for stack in dict.fromkeys(stacks)
+    }
+    groups |= {
+        f"all flats {f'behind {stack}' if stack else 'without filter'}": group
+        for stack, group in behind.items()
+        if 0 < len(group) < len(groups["all flats"])
+    }
+    result: list[_Relabelling] = []
     for low, high in combinations(voltages, 2):
         exchange = {low: high, high: low}
         for title, group in groups.items():
-            members = tuple(
-                index
-                for index, (label, kind) in enumerate(zip(labels, kinds, strict=True))
-                if kind in group and label.kV in exchange
-            )
-            if len({labels[index].kV for index in members}) < 2 or (len(group) > 1 and len(set(kinds)) < 2):
+            members = tuple(index for index in group if labels[index].kV in exchange)
+            if len({labels[index].kV for index in members}) < 2:
                 continue
             changed = list(labels)
             for index in members:
                 changed[index] = replace(labels[index], kV=exchange[labels[index].kV or 0.0])
-            text = f"{low:g} kV and {high:g} kV look exchanged in {title} ({names[members[0]]} and others)"
-            result.append((0.0, changed, members, text))
+            says = f"{low:g} kV and {high:g} kV look exchanged in"
+            result.append(_Relabelling(0.0, changed, members, says, title))
     return result
 
 
-def _candidates(suspects: Sequence[int], labels: Sequence[Label], names: Sequence[str]) -> list[_Candidate]:
-    """Labellings in which one suspect takes a label of the session, or two change places."""
-    result: list[_Candidate] = []
+def _candidates(doubtful: Sequence[int], labels: Sequence[Label], names: Sequence[str]) -> list[_Relabelling]:
+    """Labellings in which one of the doubtful series takes a label of the session, or two change places."""
+    result: list[_Relabelling] = []
     for what in _THINGS:
         price = _PRICE_OF_A_SETTING if what == "setting" else 0.0
         values = [_value(label, what) for label in labels]
         donors: dict[str, Label] = {}
         for value, label in zip(values, labels, strict=True):
             donors.setdefault(value, label)
-        for index in suspects:
+        for index in doubtful:
             for value, donor in donors.items():
                 if value != values[index]:
                     changed = list(labels)
                     changed[index] = _takes(labels[index], what, donor)
-                    text = f"{names[index]} is labelled {values[index]}, but looks like {value}"
-                    result.append((price, changed, (index,), text))
-        for index, other in combinations(suspects, 2):
+                    result.append(_Relabelling(price, changed, (index,), "looks like", value, values[index]))
+        for index, other in combinations(doubtful, 2):
             if values[index] != values[other]:
                 changed = list(labels)
                 changed[index] = _takes(labels[index], what, labels[other])
                 changed[other] = _takes(labels[other], what, labels[index])
-                text = (
-                    f"{names[index]} ({values[index]}) and {names[other]} ({values[other]})"
-                    f" look as if their {what} were exchanged"
-                )
-                result.append((price, changed, (index, other), text))
+                seen = f"its {what} ({values[index]}) and that of {names[other]} ({values[other]}) were exchanged"
+                result.append(_Relabelling(price, changed, (index, other), "looks as if", seen))
     return result
 
 

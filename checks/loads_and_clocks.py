@@ -1,4 +1,4 @@
-"""Do the labels of series fit their frames: kinds, tube load, kV, filters, clocks."""
+"""Flats whose level does not go with their tube load, and clocks that do not go with frames and order."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,69 +8,14 @@ from typing import Any
 import numpy as np
 
 from ..acquisition.acquisition_io import Series
-from ..acquisition.setting import text_from_filters
 from .findings import Finding, FindingCode
 
 # Departures of a level from its label that are no wrong label: 3 sd of the largest plausible output drift (3 % rms), and
 # a detector whose response bends by up to 5 %.
 LEVEL_FITS = 0.15
 _GAP = 2.5  # usual intervals: at least one frame and a half is missing
-_DARK_APART = 0.3  # of a flat's signal, in the median: no dark drifts by so much
 
 Levels = Mapping[str, float]
-
-
-def kind_findings(series: Sequence[Series], levels_DN: Levels, noise_DN: Levels) -> list[Finding]:
-    """Darks that are brighter than other darks by a flat's signal, and flats without light.
-
-    Args:
-        series: those that have been read.
-        levels_DN: median of each mean frame, by name.
-        noise_DN: temporal noise of one frame, by name; NaN where it is not known.
-    """
-    darks = [item for item in series if item.kind == "dark" and "offset" not in item.corrected]
-    lit = [item for item in series if item.kind == "flat" and not item.corrected & {"offset", "log"}]
-    if not darks or not lit:
-        return []
-    found = []
-    dark = min(levels_DN[item.name] for item in darks)
-    highest = max(levels_DN[item.name] for item in lit)
-    typical = float(np.median([levels_DN[item.name] for item in lit]))
-    for item in darks:
-        level = levels_DN[item.name]
-        limit = max(_DARK_APART * (typical - dark), 5.0 * _or_zero(noise_DN[item.name]))
-        if level - dark > limit > 0 and not _grows_with_exposure(item, darks, levels_DN):
-            found.append(
-                Finding(code=FindingCode.DARK_WITH_LIGHT, series=item.name, values={"level": level, "dark": dark})
-            )
-    lightless = {entry.series for entry in found}
-    good = [levels_DN[item.name] for item in darks if item.name not in lightless]
-    for item in lit:
-        level = levels_DN[item.name]
-        # means of thousands of pixels: a tenth of one pixel's noise is a signal
-        if level - max(good) <= 0.1 * _or_zero(noise_DN[item.name]) and level <= highest:
-            found.append(
-                Finding(code=FindingCode.NO_LIGHT, series=item.name, values={"level": level, "dark": max(good)})
-            )
-    return found
-
-
-def _or_zero(value: float) -> float:
-    return value if math.isfinite(value) else 0.0
-
-
-def _grows_with_exposure(item: Series, darks: Sequence[Series], levels_DN: Levels) -> bool:
-    """Whether the darks' levels rise with exposure time, so that a high level is dark current."""
-    known = [one for one in darks if one.exposure_ms is not None]
-    if item.exposure_ms is None or len(known) < 2:
-        return False
-    same = [levels_DN[one.name] for one in known if one.exposure_ms == item.exposure_ms]
-    shorter = [levels_DN[one.name] for one in known if (one.exposure_ms or 0.0) < item.exposure_ms]
-    longer = [levels_DN[one.name] for one in known if (one.exposure_ms or 0.0) > item.exposure_ms]
-    level = levels_DN[item.name]
-    typical = float(np.median(same))
-    alike = len(same) == 1 or abs(level - typical) <= 0.2 * abs(typical)
-    return alike and all(one <= level for one in shorter) and all(one >= level for one in longer) and bool(shorter)
 
 
 def _load(item: Series) -> tuple[float, str, str, float] | None:
@@ -136,61 +81,6 @@ def load_findings(series: Sequence[Series], signals_DN: Levels) -> list[Finding]
                     )
                 )
     return found
-
-
-def beam_findings(series: Sequence[Series], signals_DN: Levels) -> list[Finding]:
-    """Flats at a higher kV, or behind less filter, that give less signal a mAs: what no tube and no filter does.
-
-    Args:
-        series: flats whose loads fit their levels.
-        signals_DN: level above dark, by name.
-    """
-    rates: dict[str, float] = {}
-    for item in series:
-        load = _load(item)
-        if item.kV is not None and load is not None and load[1] == "tube load" and signals_DN[item.name] > 0:
-            distance = item.source_detector_mm or 1.0
-            rates[item.name] = signals_DN[item.name] / load[0] * distance**2
-    known = [item for item in series if item.name in rates]
-    found: dict[str, Finding] = {}
-    for one in known:
-        for other in known:
-            apart = (one.source_detector_mm is None) != (other.source_detector_mm is None) or one.layer != other.layer
-            if apart or one.name in found or other.name in found or one.session != other.session:
-                continue
-            less = rates[one.name] < rates[other.name] / (1.0 + LEVEL_FITS)
-            if one.kV is None or other.kV is None or not less:
-                continue
-            if _layers(one) == _layers(other) and one.kV > other.kV * (1.0 + LEVEL_FITS):
-                found[one.name] = Finding(
-                    code=FindingCode.KV_LABEL,
-                    series=one.name,
-                    values={"kV": one.kV, "other_kV": other.kV, "other": other.name},
-                )
-            elif one.kV == other.kV and _less_filter(one, other):
-                found[other.name] = Finding(
-                    code=FindingCode.FILTER_LABEL,
-                    series=other.name,
-                    values={
-                        "filters": text_from_filters(other.filters) or "no filter",
-                        "other_filters": text_from_filters(one.filters) or "no filter",
-                        "other": one.name,
-                    },
-                )
-    return list(found.values())
-
-
-def _less_filter(one: Series, other: Series) -> bool:
-    """Every layer of `one` stands before the other too, at least as thick, and something more."""
-
-    def thickness_mm(item: Series) -> dict[str, float]:
-        total: dict[str, float] = {}
-        for layer in item.filters:
-            total[layer.material] = total.get(layer.material, 0.0) + layer.thickness_mm
-        return total
-
-    own, more = thickness_mm(one), thickness_mm(other)
-    return own != more and all(more.get(material, 0.0) >= length for material, length in own.items())
 
 
 def clock_findings(series: Sequence[Series]) -> list[Finding]:

@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+_NAMED = 3  # series that fit into a line
+
 
 class Severity(enum.StrEnum):
     """How much a finding matters: `error` misleads a calibration or stops it, `warning` may, `note` is worth knowing."""
@@ -41,9 +43,12 @@ class FindingCode(enum.StrEnum):
     ROWS_SWAPPED = "rows_swapped"
     NO_LIGHT = "no_light"
     DARK_WITH_LIGHT = "dark_with_light"
+    SHADOW = "shadow_in_flat"
+    MAPS = "maps_against_frames"
+    LABEL = "label_against_frames"
     LOAD_LABEL = "load_against_level"
-    KV_LABEL = "kV_against_level"
-    FILTER_LABEL = "filter_against_level"
+    SPECTRUM = "no_spectrum_fits"
+    STOPS = "numbers_stop_early"
     CLOCK_STANDS = "clock_stands"
     CLOCK_GAP = "clock_gap"
     CLOCK_EXPOSURE = "clock_against_exposure"
@@ -143,26 +148,31 @@ _ENTRIES: dict[FindingCode, _Entry] = {
     ),
     FindingCode.NO_LIGHT: _Entry(
         Severity.ERROR,
-        "its level is not above the dark's ({level:.4g} against {dark:.4g} DN): the beam was off"
-        " or too weak to show, or the kinds are mixed up",
+        "a flat that shows no beam ({signal:.3g} DN above the dark): the beam was off or too weak to show, or it is a dark",
     ),
     FindingCode.DARK_WITH_LIGHT: _Entry(
         Severity.ERROR,
-        "its level of {level:.4g} DN is above the other darks' {dark:.4g} DN by more than they differ: the beam was on, or"
-        " it is a flat",
+        "a dark of {level:.4g} DN, where the other darks let expect {dark:.4g} DN: the beam was on, or it is a flat",
     ),
+    FindingCode.SHADOW: _Entry(
+        Severity.ERROR,
+        "a flat whose brightness varies by {percent:.0f} % over the field, as no other flat's does: something stood in the beam",
+    ),
+    FindingCode.MAPS: _Entry(Severity.ERROR, "{what}"),
+    FindingCode.LABEL: _Entry(Severity.ERROR, "{what}: correct the label, or leave the series out"),
     FindingCode.LOAD_LABEL: _Entry(
         Severity.ERROR,
         "its level is {percent:+.0f} % off what {quantity} says by the other flats of this beam; it fits {fits:.4g} {unit}"
         " rather than {declared:.4g} {unit}",
     ),
-    FindingCode.KV_LABEL: _Entry(
+    FindingCode.SPECTRUM: _Entry(
         Severity.ERROR,
-        "{kV:g} kV gives less signal a mAs than {other_kV:g} kV does in {other}: no tube does this; look at both labels",
+        "levels and noise of the flats fit no tube and scintillator at the kV, filters and load they state ({what})",
     ),
-    FindingCode.FILTER_LABEL: _Entry(
+    FindingCode.STOPS: _Entry(
         Severity.ERROR,
-        "more signal a mAs behind {filters} than behind {other_filters} in {other}: no filter does this; look at both labels",
+        "numbers stop at {top:.0f} DN, whatever the beam, and go on to {reached:.0f} DN in {other}: something cuts them off that"
+        " was not there always",
     ),
     FindingCode.CLOCK_STANDS: _Entry(
         Severity.WARNING, "{count} frames have the time of the frame before: the clock is coarser than the frame rate"
@@ -191,12 +201,27 @@ _ENTRIES: dict[FindingCode, _Entry] = {
 class Finding:
     """One thing that a check found.
 
-    Fields: code; series (its name, empty: of the whole file); values (what the sentence is made of).
+    Fields: code; series (its name, empty: of the whole file); others (further series that it concerns); values (what the sentence
+    is made of).
     """
 
     code: FindingCode
     series: str = ""
+    others: tuple[str, ...] = ()
     values: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all series that it concerns."""
+        return (self.series, *self.others) if self.series else ()
+
+    @property
+    def line(self) -> str:
+        """The sentence after the series that it is about."""
+        named = ", ".join(self.names[:_NAMED]) + (
+            f" and {len(self.names) - _NAMED} more" if len(self.names) > _NAMED else ""
+        )
+        return f"{named}: {self.text}" if named else self.text
 
     @property
     def severity(self) -> Severity:

@@ -13,9 +13,9 @@ import pytest
 import tifffile
 
 from raytwin.acquisition import open_acquisition
-from raytwin.calibration import frame_signs
-from raytwin.calibration.check import check_acquisition
-from raytwin.calibration.findings import Finding, FindingCode
+from raytwin.checks import frame_signs
+from raytwin.checks.check import check_acquisition
+from raytwin.checks.findings import Finding, FindingCode
 from raytwin.cli import main
 from raytwin.errors import InputError
 from raytwin.generator.twins.twin_io import write_twin
@@ -103,10 +103,8 @@ def test_every_code_has_a_sentence_of_its_values():
             "quantity",
             "fits",
             "unit",
-            "kV",
-            "other_kV",
-            "filters",
-            "other_filters",
+            "signal",
+            "reached",
             "gap",
             "usual",
             "interval_ms",

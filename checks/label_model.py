@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...acquisition.acquisition_io import AcquisitionFile
-from ...calibration.priors import PRIORS
-from ...calibration.spectral_fit import model_for
-from ...errors import InputError
-from ...generator.line.spectral_signal import OpenBeam, SpectralModel
+from ..acquisition.acquisition_io import AcquisitionFile
+from ..calibration.priors import PRIORS
+from ..calibration.spectral_fit import model_for
+from ..errors import InputError
+from ..generator.line.spectral_signal import OpenBeam, SpectralModel
 from .readings import FloatArray, Label, Reading
 
 INHERENT = PRIORS["inherent_filtration_mm_Al"]  # of a tube, beyond what is declared

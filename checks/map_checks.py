@@ -10,8 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from .findings import Finding, FindingCode
 from .label_model import DEEPEST, INHERENT, LabelModel, measured_depth
-from .readings import FloatArray, Reading, Suspect
+from .readings import FloatArray, Reading
 
 _INHERENT_TRIED_MM_AL = (*(0.25 * step for step in range(13)), 3.5, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0)  # where flats tell
 _FITS, _FITS_NOT = 0.995, 0.5  # correlations of shadow and map
@@ -30,24 +31,30 @@ _TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
 }
 
 
-def wrong_maps(judged: Sequence[Reading], maps: LabelModel) -> list[Suspect]:
+def wrong_maps(judged: Sequence[Reading], maps: LabelModel) -> list[Finding]:
     """Scenes whose thickness maps do not fit the shadow in the frames: empty, another's, turned, or of another scale."""
     placements: dict[str, list[Reading]] = {}
     for item in judged:
         if item.series.kind == "object" and maps.thickness(item.series.scene):
             placements.setdefault(item.series.scene, []).append(item)
-    found: list[Suspect] = []
+    found: list[Finding] = []
     scales: dict[str, list[list[float]]] = {}
     inherent_mm_Al = _inherent_mm_Al([item for item in judged if item.series.kind == "flat"], maps)
     for scene, members in placements.items():
         text = _unlike(scene, members, maps, list(placements))
         if text:
-            found.append(Suspect(series=tuple(item.name for item in members), text=text, evidence=200.0))
+            found.append(_finding(members, text))
             continue
         scales[scene] = [
             [value for item in members for value in _scales_of_map(item, maps, mm_Al)] for mm_Al in inherent_mm_Al
         ]
     return found + _scaled(scales, placements)
+
+
+def _finding(members: Sequence[Reading], what: str) -> Finding:
+    """Of all series of a scene."""
+    first, *others = (item.name for item in members)
+    return Finding(code=FindingCode.MAPS, series=first, others=tuple(others), values={"what": what})
 
 
 def _inherent_mm_Al(flats: Sequence[Reading], maps: LabelModel) -> tuple[float, ...]:
@@ -183,7 +190,7 @@ def _scales_of_map(item: Reading, maps: LabelModel, inherent_mm_Al: float) -> li
 
 def _scaled(
     scales: Mapping[str, Sequence[Sequence[float]]], placements: Mapping[str, Sequence[Reading]]
-) -> list[Suspect]:
+) -> list[Finding]:
     """Scenes whose path lengths want one and the same factor at every voltage, far from 1.
 
     Where all scenes at one distance want such a factor and none at another one does, it is no fault of their maps: scatter
@@ -218,12 +225,6 @@ def _scaled(
             math.copysign(1.0, middle) * float(np.median(other)) < _SCALE_OFF for other in others if other
         )
         if abs(middle) > _SCALE_OFF and not (of_the_gap or of_the_beam):
-            found.append(
-                Suspect(
-                    series=tuple(item.name for item in members),
-                    text=f"the thickness maps of {scene} fit its frames only if all path lengths are {math.exp(middle):.2f}"
-                    " times as long",
-                    evidence=100.0,
-                )
-            )
+            what = f"the thickness maps of {scene} fit its frames only if all path lengths are {math.exp(middle):.2f} times as long"
+            found.append(_finding(members, what))
     return found

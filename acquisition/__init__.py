@@ -9,7 +9,7 @@ Files:
     contrast              contrast of a foreign object in a pair
     sessions              several sessions as one; one layer of a dual-layer panel
     series_roles          which series of a session calibrate
-    coarser               squares of pixels as pixels
+    binned_frames         frames and maps of binned pixels
     log_images            frames of I/I0 or its logarithm as light
     cut_off               frames that end at 0
     import_any            the layout of a folder, and a sidecar to start from

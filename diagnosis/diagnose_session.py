@@ -13,7 +13,7 @@ from ..generator.line.twin import Twin
 from .judgement.answer import Diagnosis, in_pixels
 from .judgement.judgement import judge
 from .problem.assemble import problem_of
-from .session.coarse import unseen_in_squares
+from .session.binning import lost_by_binning
 from .session.preparation import calibrated_twin, findings_left, mislabelled, prepare_session
 
 
@@ -55,7 +55,7 @@ def _diagnosed(
     wrong: tuple[Finding, ...] = ()
     while True:
         session = prepare_session(acquisition, twin=twin, rng=rng, contradicted=wrong, progress=progress)
-        unseen = unseen_in_squares() if session.factor > 1 else {}
+        unseen = lost_by_binning() if session.factor > 1 else {}
         left = session.findings
         try:
             problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)

@@ -24,9 +24,9 @@ from raytwin.diagnosis.inference.observed import Observed, Point
 from raytwin.diagnosis.inference.pairs import Single, log_prior, weigh_pairs
 from raytwin.diagnosis.inference.refine import tasks_of
 from raytwin.diagnosis.inference.search import Slopes, _in_turn, _within, searched
-from raytwin.diagnosis.inference.seen import Blocks, Seen
+from raytwin.diagnosis.inference.seen import Blocks, FitTarget
 from raytwin.diagnosis.inference.steady import Steady
-from raytwin.diagnosis.inference.unknown import Families, beyond
+from raytwin.diagnosis.inference.unknown import Families, fit_extra_variance
 from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _strained, _with_curves
 from raytwin.diagnosis.judgement.strengths import _outright, applied_at_best
 from raytwin.diagnosis.model.changes import Variant
@@ -703,7 +703,7 @@ def test_a_refined_curve_goes_as_far_as_the_model_can_be_asked():
         return {0: np.outer(variants[0].strengths, response)} if max(variants[0].strengths) < 10.0 else {}
 
     observed = seen(9.0 * response + 0.1 * rng.standard_normal(PROBES))
-    what = Seen(observed=observed, respond=respond, whitener=SimpleNamespace(apply=np.asarray))
+    what = FitTarget(observed=observed, respond=respond, whitener=SimpleNamespace(apply=np.asarray))
     fit = what.fit(grid)
     assert fit.best == pytest.approx(7.5)  # as far as the grid is believed
     found = searched(fit, what)
@@ -833,7 +833,7 @@ def test_the_likelihood_beside_an_effect_is_that_of_its_law_and_what_it_may_be_o
     factors = rng.standard_normal((PROBES, 4))
     curve = one_node("a", 3.0 * rng.standard_normal(PROBES))
     observed = seen(noise(rng, factors) + curve.response(2.0), factors)
-    beside = observed.beside(Point(curve=curve, strength=2.0, level=0.2))
+    beside = observed.in_presence_of(Point(curve=curve, strength=2.0, level=0.2))
     back = beside.units[:, None] * beside.nuisances.full()
     covariance = np.diag(beside.units**2) + back @ back.T
     left = observed.residual - curve.response(2.0)
@@ -852,7 +852,7 @@ def test_the_evidence_of_an_effect_at_its_point_is_the_integral_over_the_strengt
     residual = curve.response(strength) + np.random.default_rng(3).standard_normal(PROBES)
     observed = seen(residual)
     point = fit_curve(observed, curve, exact=True).point
-    evidence = observed.beside(point).log_likelihood - observed.log_likelihood + log_prior(observed, point)
+    evidence = observed.in_presence_of(point).log_likelihood - observed.log_likelihood + log_prior(observed, point)
     # by hand: a Gaussian in the strength; 0.99 of the prior is plausible, the last case wants less than is tried
     low, high = curve.reach
     x = np.linspace(np.log(low), np.log(high), 2_000_001)
@@ -914,7 +914,7 @@ def test_a_law_of_known_course_leaves_nothing_in_the_noise_of_frames_beyond_its_
     observed = replace(seen(residual), aspects=2 * GROUPS + of_noise)
     chosen = [strong, weak, *(varied(one, high=5000.0) for one in made[2:])]
     found = weigh_hypotheses(
-        [(observed, fit_effects(observed, chosen))], families=Families(of=GROUPS, names=NAMES), rests=False
+        [(observed, fit_effects(observed, chosen))], families=Families(of=GROUPS, names=NAMES), misfits=False
     )
     assert found[0].effects == named
 
@@ -959,7 +959,7 @@ def test_what_a_curve_moves_in_a_series_is_what_it_would_move_there_alone_whatev
     (curve,) = independent((300, 1.0))
     common = 3.0 * rng.standard_normal((PROBES, 2))  # moves all series together
     observed = seen(noise(rng, common), common)
-    squares = observed.squares_by_part(curve, 20.0, observed.series)
+    squares = observed.power_by_part(curve, 20.0, observed.series)
     covariance = np.eye(PROBES) + common @ common.T
     alone = np.where(GROUPS == 4, curve.response(20.0), 0.0)
     assert squares[4] == pytest.approx(alone @ np.linalg.solve(covariance, alone), rel=1e-9)
@@ -989,11 +989,11 @@ def test_a_law_that_leaves_a_rest_elsewhere_is_named_with_the_place_of_the_rest(
     (one,) = independent((300, 1.0))
     one = varied(one, high=5000.0)
     residual = 400.0 * one.response(1.0) + rng.standard_normal(PROBES)
-    assert weigh(residual, np.zeros((PROBES, 1)), [one])[0].rest == ""
+    assert weigh(residual, np.zeros((PROBES, 1)), [one])[0].misfit == ""
     residual[GROUPS >= 24] += 8.0 * rng.standard_normal(int(np.count_nonzero(GROUPS >= 24)))
     found = weigh(residual, np.zeros((PROBES, 1)), [one])
     assert found[0].effects == ("effect0",)
-    assert found[0].rest in {f"group {number}" for number in range(24, 30)}
+    assert found[0].misfit in {f"group {number}" for number in range(24, 30)}
 
 
 def test_one_family_that_is_off_by_a_little_is_no_effect_and_several_are_an_unknown_one(setup):
@@ -1007,7 +1007,7 @@ def test_one_family_that_is_off_by_a_little_is_no_effect_and_several_are_an_unkn
     assert weigh(many, factors, chosen)[0].effects == (UNKNOWN,)
     much = residual.copy()
     much[GROUPS == 7] += 2.5 * rng.standard_normal(20)
-    assert beyond(seen(much, factors), Families(of=GROUPS, names=NAMES)).place == "group 7"
+    assert fit_extra_variance(seen(much, factors), Families(of=GROUPS, names=NAMES)).place == "group 7"
 
 
 def test_a_law_leaves_no_rest_in_what_one_effect_alone_can_make(setup):
@@ -1016,10 +1016,10 @@ def test_a_law_leaves_no_rest_in_what_one_effect_alone_can_make(setup):
     much[GROUPS == 7] += 2.5 * rng.standard_normal(20)
     families = Families(of=GROUPS, names=NAMES, exact=frozenset({7}))
     observed = seen(much, factors)
-    assert beyond(observed, families).place == "group 7"
-    left = beyond(observed, families, left_by_laws=True)
+    assert fit_extra_variance(observed, families).place == "group 7"
+    left = fit_extra_variance(observed, families, left_by_laws=True)
     assert left.place != "group 7"
-    assert left.log_evidence < beyond(observed, families).log_evidence - 5.0
+    assert left.log_evidence < fit_extra_variance(observed, families).log_evidence - 5.0
 
 
 def test_the_weaker_of_two_effects_is_weighed_as_it_acts_beside_the_stronger_one_and_beside_no_other():

@@ -124,14 +124,14 @@ def test_the_evidence_does_not_hang_on_which_effects_the_twin_has(line):
         residual=line.noise + shown, nuisances=Nuisances(line.factors), groups=GROUPS, places=GROUPS, series=GROUPS
     )
     given = Observed(**{**bare.__dict__, "given": (own,)})
-    assert given.standing("motion").log_likelihood == bare.log_likelihood
+    assert given.conditioned("motion").log_likelihood == bare.log_likelihood
     free = 0.12 * line.motion
     covariance = np.eye(PROBES) + line.factors @ line.factors.T + np.outer(free, free)
     left = line.noise + 0.5 * line.tail
     expected = -0.5 * (np.linalg.slogdet(covariance)[1] + left @ np.linalg.solve(covariance, left))
-    assert given.standing().log_likelihood == pytest.approx(expected, rel=1e-3)
-    assert bare.over_none("motion") == 0.0
-    assert given.over_none("motion") == pytest.approx(bare.log_likelihood - expected, rel=1e-3)
+    assert given.conditioned().log_likelihood == pytest.approx(expected, rel=1e-3)
+    assert bare.log_evidence_without("motion") == 0.0
+    assert given.log_evidence_without("motion") == pytest.approx(bare.log_likelihood - expected, rel=1e-3)
 
 
 def test_an_effect_takes_the_place_of_the_same_one_that_the_base_has():

@@ -52,11 +52,11 @@ def problem(curves, *, factors=None, noise=1.0):
     )
 
 
-def open_problem(curves, *, let_in=None):
+def open_problem(curves, *, border_inflow=None):
     """A problem whose forward model can be asked again for what an effect lets in by chance."""
     own = problem(curves)
     whole = Problem(**{item.name: getattr(own, item.name, None) for item in fields(Problem)})
-    return replace(whole, again=SimpleNamespace(let_in=lambda _: let_in))
+    return replace(whole, again=SimpleNamespace(border_inflow=lambda _: border_inflow))
 
 
 def test_effects_at_right_angles_lie_as_far_apart_as_from_nothing_and_parallel_ones_not_at_all():
@@ -404,7 +404,7 @@ def test_a_refined_variant_keeps_what_the_one_it_came_from_does_by_chance():
 def test_a_refined_variant_lets_in_what_its_own_strengths_do():
     glare = next(item for item in catalogue_variants() if item.effect == "veiling_glare")
     whole = open_problem(
-        [Curve(variant=glare, responses=axis(0)[None, :], spread=axis(1)[:, None])], let_in=axis(2)[:, None]
+        [Curve(variant=glare, responses=axis(0)[None, :], spread=axis(1)[:, None])], border_inflow=axis(2)[:, None]
     )
     found = whole.with_variants([(glare, np.stack([axis(0)] * len(glare.strengths)))]).curves[-1]
     np.testing.assert_array_equal(found.spread, axis(2)[:, None])

@@ -13,7 +13,7 @@ from raytwin.checks.labels import check_labels
 from raytwin.cli import main
 from raytwin.diagnosis.inference.nuisances import Nuisances, Whitening
 from raytwin.diagnosis.inference.observed import Observed
-from raytwin.diagnosis.inference.unknown import beyond
+from raytwin.diagnosis.inference.unknown import fit_extra_variance
 from raytwin.diagnosis.model.changes import LEVEL_OF_SERIES_SD, POSITION_SD_PX, catalogue_variants
 from raytwin.diagnosis.problem.assemble import build_problem, map_changes
 from raytwin.diagnosis.problem.series_probes import mean_frame
@@ -93,7 +93,7 @@ def test_scenes_that_all_lie_elsewhere_are_seen_as_a_family_of_their_own(line):
         seen = Observed(
             residual=residual, nuisances=shared, groups=problem.groups, places=problem.places, series=problem.series_of
         )
-        return beyond(seen, problem.families)
+        return fit_extra_variance(seen, problem.families)
 
     assert unknown(0.0).log_evidence < 0.0
     found_there = unknown(8.0)

@@ -1,7 +1,7 @@
 """How far laws of an effect's kind depart from the catalogue's: learnt from sessions of the second simulator and of the lab.
 
 Each session has one effect, by the simulator's own law or a drawn family (`law_families.py`). The evidence of that effect at each
-level of discrepancy, with and without a rest, tells how often each occurs and how long rests are (empirical Bayes, by expectation
+level of discrepancy, with and without a misfit, tells how often each occurs and how long misfits are (empirical Bayes, by expectation
 and maximisation); the same of what looks most like it once it is left out of the catalogue. The answers themselves are told beside
 it.
 
@@ -26,7 +26,7 @@ import second_simulator as plain
 from raytwin.acquisition import open_acquisition
 from raytwin.diagnosis.inference.curve_fits import CurveFit
 from raytwin.diagnosis.inference.discrepancy import LEVELS
-from raytwin.diagnosis.inference.inference import UNKNOWN, evidence_with_rest
+from raytwin.diagnosis.inference.inference import UNKNOWN, evidence_with_misfit
 from raytwin.diagnosis.inference.unknown import LOG_DENSITY
 from raytwin.diagnosis.judgement.judgement import Weighed, verdict_of, weigh_problem
 from raytwin.diagnosis.problem.assemble import problem_of
@@ -36,7 +36,7 @@ from raytwin.diagnosis.session.preparation import prepare_session
 _ROUNDS = 300
 _CLEAR = 3.0  # log evidence from which something is said
 _NONE = 1e-3  # least frequency of a level: none is impossible
-_SHORTEST = 1e-3  # of a rest over what laws do: shorter ones do not show
+_SHORTEST = 1e-3  # of a misfit over what laws do: shorter ones do not show
 
 
 def session_row(path: Path, planted: str) -> dict:
@@ -73,14 +73,16 @@ def _likest(fits: Sequence[CurveFit]) -> CurveFit:
 
 
 def told_by_law(weighed: Weighed, fit: CurveFit, *, another: bool = False) -> dict:
-    """Log evidence of a law by level, and with a rest of any length beside it; that length over what the law does.
+    """Log evidence of a law by level, and with a misfit of any length beside it; that length over what the law does.
 
-    another: the effect is only like the law's: it has any strength, and where it leaves a rest the law is off by most.
+    another: the effect is only like the law's: it has any strength, and where it leaves a misfit the law is off by most.
     """
     by_level = fit.at_any_strength if another else fit.by_level
     point = fit.at_level(LEVELS.levels[-1] if another else fit.level)
-    evidence, ratio = evidence_with_rest(weighed.observed, [point], families=weighed.problem.families, another=another)
-    return {"by_level": list(by_level), "with_rest": evidence, "ratio": ratio}
+    evidence, ratio = evidence_with_misfit(
+        weighed.observed, [point], families=weighed.problem.families, another=another
+    )
+    return {"by_level": list(by_level), "with_misfit": evidence, "ratio": ratio}
 
 
 def told(hypotheses) -> dict:
@@ -90,7 +92,7 @@ def told(hypotheses) -> dict:
 
 
 def frequencies(rows: list[dict], density: Callable[[list[float], list[float]], tuple]) -> dict:
-    """Frequencies of the levels and of a rest, and what is known of its length, that make the evidences of sessions likeliest.
+    """Frequencies of the levels and of a misfit, and what is known of its length, that make the evidences of sessions likeliest.
 
     A session in which the effect does not show tells nothing and is left out.
 
@@ -98,11 +100,11 @@ def frequencies(rows: list[dict], density: Callable[[list[float], list[float]], 
         rows: as `told_by_law` makes them.
         density: of the ratios and how much each counts: what is fitted, and the log density of each ratio in its logarithm.
     """
-    known = [row for row in rows if max(*row["by_level"], row["with_rest"]) > _CLEAR]
+    known = [row for row in rows if max(*row["by_level"], row["with_misfit"]) > _CLEAR]
     by_level = np.array([row["by_level"] for row in known])
-    with_rest = np.array([row["with_rest"] for row in known])
+    with_misfit = np.array([row["with_misfit"] for row in known])
     ratios = [max(row["ratio"], _SHORTEST) for row in known]
-    levels, rest, of_length = (
+    levels, misfit, of_length = (
         np.full(len(LEVELS.levels), 1.0 / len(LEVELS.levels)),
         0.5,
         np.full(len(known), LOG_DENSITY),
@@ -111,8 +113,8 @@ def frequencies(rows: list[dict], density: Callable[[list[float], list[float]], 
     for _ in range(_ROUNDS):
         scores = np.concatenate(
             [
-                by_level + np.log(levels * (1.0 - rest)),
-                (with_rest + of_length - LOG_DENSITY + math.log(rest))[:, None],
+                by_level + np.log(levels * (1.0 - misfit)),
+                (with_misfit + of_length - LOG_DENSITY + math.log(misfit))[:, None],
             ],
             axis=1,
         )
@@ -121,9 +123,9 @@ def frequencies(rows: list[dict], density: Callable[[list[float], list[float]], 
         np.add.at(taken, np.argmax(by_level, axis=1), shares[:, -1])
         levels = np.maximum(taken / taken.sum(), _NONE)
         levels /= levels.sum()
-        rest = min(max(float(shares[:, -1].mean()), _NONE), 1.0 - _NONE)
+        misfit = min(max(float(shares[:, -1].mean()), _NONE), 1.0 - _NONE)
         fitted, of_length = density(ratios, list(shares[:, -1]))
-    return {"levels": [round(float(one), 3) for one in levels], "rest": round(rest, 3), "length": fitted}
+    return {"levels": [round(float(one), 3) for one in levels], "misfit": round(misfit, 3), "length": fitted}
 
 
 def about_nothing(ratios: list[float], counts: list[float]) -> tuple[float, np.ndarray]:
@@ -143,8 +145,8 @@ def of_logarithm(ratios: list[float], counts: list[float]) -> tuple[list[float],
 
 
 def _most(told: dict | None) -> float:
-    """The most that a law tells, with a rest or without."""
-    return -math.inf if told is None else max(*told["by_level"], told["with_rest"])
+    """The most that a law tells, with a misfit or without."""
+    return -math.inf if told is None else max(*told["by_level"], told["with_misfit"])
 
 
 def learn(paths: list[Path]) -> None:
@@ -157,8 +159,8 @@ def learn(paths: list[Path]) -> None:
     kind = frequencies([row["kind"] for row in seen], about_nothing)
     another = frequencies([row["another"] for row in rows if "another" in row], of_logarithm)
     print(f"levels = {list(LEVELS.levels)}\nof_kind = {kind['levels']}\nof_another = {another['levels']}")
-    print(f"rest_of_kind = {kind['rest']}\nrest_of_another = {another['rest']}")
-    print(f"rest_sd_of_kind = {kind['length']}\nrest_of_another_log = {another['length']}")
+    print(f"misfit_of_kind = {kind['misfit']}\nmisfit_of_another = {another['misfit']}")
+    print(f"misfit_sd_of_kind = {kind['length']}\nmisfit_of_another_log = {another['length']}")
     single = [row for row in rows if row["planted"] not in ("none", *plain.UNKNOWN)]
     print(f"# named alone {sum(row['named'] == [row['planted']] for row in single)} of {len(single)}")
     wrong = [row for row in single if set(row["named"]) - {row["planted"]}]

@@ -12,7 +12,7 @@ from ...generator.effects import EFFECTS
 from ...generator.line.twin import Twin
 from ...results import Result, Table, axes_or_new, frame, plain
 from ..problem.assemble import problem_of
-from ..session.coarse import unseen_in_squares
+from ..session.binning import lost_by_binning
 from ..session.preparation import prepare_session
 from .plan import Distinguishability, distinguishability
 
@@ -110,10 +110,10 @@ def plan_session(
     # thousands of small matrices: threads would wait for each other longer than they work
     with threadpool_limits(limits=1, user_api="blas"):
         session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
-        unseen = unseen_in_squares() if session.factor > 1 else {}
+        unseen = lost_by_binning() if session.factor > 1 else {}
         problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
         found = distinguishability(problem)
-    shares = [EFFECTS[effect].strength.pixels_per_square(session.factor) for effect in found.effects]
+    shares = [EFFECTS[effect].strength.pixels_per_bin(session.factor) for effect in found.effects]
     return SessionPlan(
         distinguishability=replace(found, strengths=found.strengths * shares, seen_from=found.seen_from * shares),
         cannot_be_judged={**problem.missing_effects, **unseen},

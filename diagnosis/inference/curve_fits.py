@@ -98,9 +98,9 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
 
 def fit_effect(observed: Observed, curve: Curve, *, exact: bool = False) -> CurveFit:
     """A curve fitted to what is weighed, where the twin has all its effects but this one; evidence over all that it has."""
-    alone = observed.standing(curve.effect)
+    alone = observed.conditioned(curve.effect)
     fit = fit_curve(alone, curve, exact=exact)
-    more = observed.over_none(curve.effect)
+    more = observed.log_evidence_without(curve.effect)
     return replace(
         fit,
         by_level=fit.by_level + more,

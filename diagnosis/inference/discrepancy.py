@@ -24,18 +24,19 @@ class Levels:
     """Levels of discrepancy and how often they occur.
 
     Fields: levels (level,), relative; of_kind (level,): their frequencies where the effect is of the kind that a law describes;
-    of_another: where it is not, and the law is the one of the catalogue that resembles it most; rest_of_kind, rest_of_another: how
-    often such a law leaves a rest in some families of probes beyond that; rest_sd_of_kind: of the length of a rest over that of what
-    the laws do, as a Gaussian about 0; rest_of_another_log: mean and standard deviation of the logarithm of that, a Gaussian.
+    of_another: where it is not, and the law is the one of the catalogue that resembles it most; misfit_of_kind, misfit_of_another:
+    how often such a law leaves a misfit in some families of probes beyond that; misfit_sd_of_kind: of the length of a misfit over
+    that of what the laws do, as a Gaussian about 0; misfit_of_another_log: mean and standard deviation of the logarithm of that, a
+    Gaussian.
     """
 
     levels: tuple[float, ...]
     of_kind: tuple[float, ...]
     of_another: tuple[float, ...]
-    rest_of_kind: float
-    rest_of_another: float
-    rest_sd_of_kind: float
-    rest_of_another_log: tuple[float, float]
+    misfit_of_kind: float
+    misfit_of_another: float
+    misfit_sd_of_kind: float
+    misfit_of_another_log: tuple[float, float]
 
     def up_to(self, level: float) -> "Levels":
         """Those up to a level, with frequencies as they are."""
@@ -74,7 +75,7 @@ PROBE_SHARE = 0.5  # of a level that is each probe's own
 ELSEWHERE_SHARE = 0.1  # of a level, times the rms of what the law foretells in a place, in each probe of the place
 EXACT_LAW_ERROR = 0.03  # relative error of probes that a strength is defined by
 LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
-_LEAST_RATIO = 1e-3  # of a rest over what laws do: shorter ones do not show
+_LEAST_RATIO = 1e-3  # of a misfit over what laws do: shorter ones do not show
 LEAST_MOVED = 0.3  # standard deviations of a probe by which what is random about a law must move one to be carried
 _TIMES_SEEN = (
     1.5  # what a law predicts in a place over what is seen there, up to which it may be off by a share of itself
@@ -163,16 +164,16 @@ def law_terms(
     return factors, own_variance(curve, strength, response, places, level)
 
 
-def log_rest(ratio: float, *, another: bool = False) -> float:
-    """Log density, in the logarithm of it, of how many times as long a rest is as what the laws beside it do.
+def log_misfit(ratio: float, *, another: bool = False) -> float:
+    """Log density, in the logarithm of it, of how many times as long a misfit is as what the laws beside it do.
 
     another: the laws are only like what is there.
     """
     ratio = max(ratio, _LEAST_RATIO)
     if another:
-        middle, sd = LEVELS.rest_of_another_log
+        middle, sd = LEVELS.misfit_of_another_log
         return -0.5 * ((math.log(ratio) - middle) / sd) ** 2 - math.log(math.sqrt(2.0 * math.pi) * sd)
-    share = ratio / LEVELS.rest_sd_of_kind
+    share = ratio / LEVELS.misfit_sd_of_kind
     return math.log(share) + 0.5 * math.log(2.0 / math.pi) - 0.5 * share**2
 
 

@@ -4,8 +4,8 @@ Probes are residuals r (probe,) against the twin, in units of their own standard
 integrated out exactly (they are linear with Gaussian priors): r ~ N(m, C), C = I + F F^T, F (probe, factor) the
 responses to the nuisances times their prior standard deviations.
 
-    none      m = 0, or what the twin's own effects do, known but for their laws (`Observed.standing`)
-    effect    m = m_e(s), s the strength, log-uniform over its plausible range; its law is off by a level and may leave a rest in
+    none      m = 0, or what the twin's own effects do, known but for their laws (`Observed.conditioned`)
+    effect    m = m_e(s), s the strength, log-uniform over its plausible range; its law is off by a level and may leave a misfit in
               any families of probes (`discrepancy`), over which the evidence is averaged; what it does by chance is extra covariance
     pair      m = m_e(s) + m_f(t), each law off by a level of its own
     unknown   m = 0 and an extra variance in any number of families of probes; or like an effect of the catalogue, or like two, of
@@ -21,13 +21,13 @@ import numpy as np
 
 from ..model.curves import Curve
 from .curve_fits import CurveFit, interval_of, log_mean_exp
-from .discrepancy import LEVELS, at_most_off, log_frequency, log_rest
+from .discrepancy import LEVELS, at_most_off, log_frequency, log_misfit
 from .observed import Observed, Point
-from .pairs import Single, left_by_the_stronger, left_in_place, log_prior, weigh_pairs
-from .unknown import LOG_DENSITY, Beyond, Families, beyond
+from .pairs import Single, log_odds_of_leak, log_odds_of_leak_in, log_prior, weigh_pairs
+from .unknown import LOG_DENSITY, ExtraVariance, Families, fit_extra_variance
 
 UNKNOWN = "unknown_effect"
-_WITH_REST = 3  # effects, and pairs, the likeliest, whose rest is looked at
+_WITH_MISFIT = 3  # effects, and pairs, the likeliest, whose misfit is looked at
 # the likeliest effects that are the first of a pair: with six the same are named (notebook, ablation)
 _PAIRS_FROM = 2
 
@@ -38,7 +38,7 @@ class Hypothesis:
 
     Fields: effects (ids; empty for none; `("unknown_effect",)` for an effect outside the catalogue); probability; log_evidence;
     strengths per effect: best value and 95 % interval (value, low, high); variants per effect; levels: of discrepancy, per effect;
-    location: probe group of an unknown effect; rest: the one in which laws leave most, empty where they leave nothing.
+    location: probe group of an unknown effect; misfit: the family in which laws leave most, empty where they leave nothing.
     """
 
     effects: tuple[str, ...]
@@ -48,7 +48,7 @@ class Hypothesis:
     variants: Mapping[str, Curve] = field(default_factory=dict)
     levels: Mapping[str, float] = field(default_factory=dict)
     location: str = ""
-    rest: str = ""
+    misfit: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,7 +67,7 @@ def weigh_hypotheses(
     families: Families,
     priors: Priors | None = None,
     of_catalogue: int = 0,
-    rests: bool = True,
+    misfits: bool = True,
     beside: Sequence[Curve] = (),
 ) -> tuple[Hypothesis, ...]:
     """All hypotheses, most probable first; their probabilities sum to 1.
@@ -82,15 +82,15 @@ def weigh_hypotheses(
         families: of probes, in which an unknown effect may show.
         priors: of the kinds of hypothesis.
         of_catalogue: number of effects that share the priors, those that cannot show here among them; at least those with fits.
-        rests: laws may leave a rest; False: they may not, a first look at a third of the cost.
+        misfits: laws may leave a misfit; False: they may not, a first look at a third of the cost.
         beside: curves of effects as they respond beside another.
     """
     weighed: list[tuple[Hypothesis, float]] = []
     for observed, fits in seen:
         # one zero for all, and how often laws are off by so much
-        zero = observed.standing().log_likelihood - seen[0][0].standing().log_likelihood
+        zero = observed.conditioned().log_likelihood - seen[0][0].conditioned().log_likelihood
         zero += log_frequency(observed.given[0].level) if len(seen) > 1 else 0.0
-        found = _weighed(observed, fits, families, priors or Priors(), of_catalogue, rests, beside)
+        found = _weighed(observed, fits, families, priors or Priors(), of_catalogue, misfits, beside)
         weighed += [(replace(item, log_evidence=item.log_evidence + zero), prior) for item, prior in found]
     return _by_effects(weighed)
 
@@ -101,17 +101,17 @@ def _weighed(
     families: Families,
     priors: Priors,
     of_catalogue: int,
-    rests: bool,
+    misfits: bool,
     beside: Sequence[Curve],
 ) -> list[tuple[Hypothesis, float]]:
     """All hypotheses with their log evidence over none, and the logarithms of their priors."""
     singles = _singles(fits)
     count = max(len(singles), of_catalogue, 1)
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
-    looked_at = _WITH_REST if rests else 0
-    left = _Rests(observed, families)
+    looked_at = _WITH_MISFIT if misfits else 0
+    left = _Misfits(observed, families)
     none = left.none
-    nothing = left.no_effect(rests)
+    nothing = left.no_effect(misfits)
     weighed = [(nothing, math.log(priors.none))]
     of_single = math.log(priors.single / count)
     alike, like_two, whole = [], [], {}
@@ -136,12 +136,12 @@ def _weighed(
             like_two.append(another)
         weighed.append((found, of_pair))
         # or the weaker of them is what the stronger one's law leaves; not one that the twin has, which would have to be there
-        strong, leaves = left_by_the_stronger(observed, pair)
+        strong, leaves = log_odds_of_leak(observed, pair)
         if any(observed.has(effect) for effect in pair.effects if effect != strong):
             continue
         # as it is once that is taken off
         alone = _of_fits((strong,), {strong: pair.fits[strong]}, found.log_evidence + leaves)
-        alone = replace(alone, rest=found.rest)
+        alone = replace(alone, misfit=found.misfit)
         if alone.log_evidence > leaks.get(strong, singles[strong]).log_evidence:
             leaks[strong] = alone
     weighed += [(item, of_single) for item in leaks.values()]
@@ -161,7 +161,7 @@ def _left_by_given(
 ) -> float | None:
     """Log evidence over none of what laws of the twin's own effects leave in the shape of another; None: the twin has none.
 
-    weighed: each effect alone, with a rest or without.
+    weighed: each effect alone, with a misfit or without.
     """
     others = [effect for effect in singles if not observed.has(effect)]
     if not (observed.given and others):
@@ -169,7 +169,7 @@ def _left_by_given(
     acting = observed.acting(observed.given)
     levels = [(1.0, at_most_off(observed.given[0].level))]
     return max(
-        weighed[effect].log_evidence + left_in_place(observed, singles[effect].best, acting, levels)
+        weighed[effect].log_evidence + log_odds_of_leak_in(observed, singles[effect].best, acting, levels)
         for effect in others
     )
 
@@ -189,61 +189,63 @@ def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis
     return tuple(sorted(every, key=lambda item: (-item.probability, -item.log_evidence)))
 
 
-def evidence_with_rest(
+def evidence_with_misfit(
     observed: Observed,
     points: Sequence[Point],
     *,
     families: Families,
     another: bool = False,
 ) -> tuple[float, float]:
-    """Log evidence over none of effects at their points with a rest beside them of any length, and its length over theirs.
+    """Log evidence over none of effects at their points with a misfit beside them of any length, and its length over theirs.
 
     another: they are only like these.
     """
-    rests = _Rests(observed, families)
-    evidence, found = rests.beside(points)
-    return evidence + rests.prior(points, another=another), rests.ratio(points, found)
+    misfits = _Misfits(observed, families)
+    evidence, found = misfits.in_presence_of(points)
+    return evidence + misfits.prior(points, another=another), misfits.ratio(points, found)
 
 
-class _Rests:
+class _Misfits:
     """What laws leave beside effects, in families of probes."""
 
     def __init__(self, observed: Observed, families: Families) -> None:
         self._observed = observed
         self._families = families
-        self.none = beyond(observed.standing(), families)
+        self.none = fit_extra_variance(observed.conditioned(), families)
 
-    def no_effect(self, rests: bool) -> Hypothesis:
-        """What the twin has and nothing else; with `rests` the laws of that may leave a rest."""
+    def no_effect(self, misfits: bool) -> Hypothesis:
+        """What the twin has and nothing else; with `misfits` the laws of that may leave a misfit."""
         plain = Hypothesis(effects=(), probability=0.0, log_evidence=0.0)
-        if not (rests and self._observed.given):
+        if not (misfits and self._observed.given):
             return plain
-        found = beyond(self._observed.standing(), self._families, left_by_laws=True)
+        found = fit_extra_variance(self._observed.conditioned(), self._families, left_by_laws=True)
         return self._weighed(plain, [], found.log_evidence, found)
 
     def of_kind(self, hypothesis: Hypothesis, fits: Sequence[CurveFit]) -> tuple[Hypothesis, float]:
-        """A hypothesis whose laws may leave a rest, and log evidence over none of what is only like its effects.
+        """A hypothesis whose laws may leave a misfit, and log evidence over none of what is only like its effects.
 
         fits: of its effects, whose curves are in the first units.
         """
         points = [fit.point for fit in fits]
-        evidence, found = self.beside(points)
+        evidence, found = self.in_presence_of(points)
         another = evidence + self.prior(points, another=True)
         whole = self._weighed(hypothesis, points, evidence + self.prior(points), found)
         return whole, self._like(points, another - found.log_evidence, another, found)
 
-    def _weighed(self, hypothesis: Hypothesis, points: Sequence[Point], evidence: float, found: Beyond) -> Hypothesis:
-        """A hypothesis with log evidence `evidence` where there is a rest `found`, and without."""
-        plain = hypothesis.log_evidence + math.log1p(-LEVELS.rest_of_kind)
-        with_rest = evidence + math.log(LEVELS.rest_of_kind) + log_rest(self.ratio(points, found)) - LOG_DENSITY
+    def _weighed(
+        self, hypothesis: Hypothesis, points: Sequence[Point], evidence: float, found: ExtraVariance
+    ) -> Hypothesis:
+        """A hypothesis with log evidence `evidence` where there is a misfit `found`, and without."""
+        plain = hypothesis.log_evidence + math.log1p(-LEVELS.misfit_of_kind)
+        with_misfit = evidence + math.log(LEVELS.misfit_of_kind) + log_misfit(self.ratio(points, found)) - LOG_DENSITY
         return replace(
             hypothesis,
-            log_evidence=float(np.logaddexp(plain, with_rest)),
-            rest=found.place if with_rest > plain else "",
+            log_evidence=float(np.logaddexp(plain, with_misfit)),
+            misfit=found.place if with_misfit > plain else "",
         )
 
-    def ratio(self, points: Sequence[Point], found: Beyond) -> float:
-        """Length of a rest over that of what the laws beside it do, those of the twin's own effects among them."""
+    def ratio(self, points: Sequence[Point], found: ExtraVariance) -> float:
+        """Length of a misfit over that of what the laws beside it do, those of the twin's own effects among them."""
         named = {point.curve.effect for point in points}
         acting = [*points, *(point for point in self._observed.given if point.curve.effect not in named)]
         moved = math.hypot(*(self._observed.length(point.curve, point.strength) for point in acting))
@@ -259,33 +261,33 @@ class _Rests:
         full = [fit for fit in single.fits if len(fit.by_level) > 1]
         plain = log_mean_exp([fit.of_another(any_strength=any_strength) for fit in full])
         points = [single.best.at_level(LEVELS.levels[-1])]
-        evidence, found = self.beside(points)
+        evidence, found = self.in_presence_of(points)
         return self._like(points, plain, evidence + self.prior(points, another=True), found)
 
-    def _like(self, points: Sequence[Point], plain: float, evidence: float, found: Beyond) -> float:
-        """Log evidence of what is only like effects: `plain` without a rest, `evidence` with the one that was found."""
-        evidence += log_rest(self.ratio(points, found), another=True) - LOG_DENSITY
-        share = LEVELS.rest_of_another
+    def _like(self, points: Sequence[Point], plain: float, evidence: float, found: ExtraVariance) -> float:
+        """Log evidence of what is only like effects: `plain` without a misfit, `evidence` with the one that was found."""
+        evidence += log_misfit(self.ratio(points, found), another=True) - LOG_DENSITY
+        share = LEVELS.misfit_of_another
         return float(np.logaddexp(plain + math.log1p(-share), evidence + math.log(share)))
 
-    def beside(self, points: Sequence[Point]) -> tuple[float, Beyond]:
-        """Log evidence over none, without priors, of effects at their points with a rest beside them, and what that rest is."""
+    def in_presence_of(self, points: Sequence[Point]) -> tuple[float, ExtraVariance]:
+        """Log evidence over none, without priors, of effects at their points with a misfit beside them, and what that misfit is."""
         effects = [point.curve.effect for point in points]
-        alone = beside = self._observed.standing(*effects)
+        alone = beside = self._observed.conditioned(*effects)
         for point in points:
-            beside = beside.beside(point)
-        found = beyond(beside, self._families, left_by_laws=True)
-        evidence = self._observed.over_none(*effects) + beside.log_likelihood - alone.log_likelihood
+            beside = beside.in_presence_of(point)
+        found = fit_extra_variance(beside, self._families, left_by_laws=True)
+        evidence = self._observed.log_evidence_without(*effects) + beside.log_likelihood - alone.log_likelihood
         return evidence + found.log_evidence, found
 
     def prior(self, points: Sequence[Point], *, another: bool = False) -> float:
         """Log of what effects at their points take of the prior; another: of what is only like them."""
-        alone = self._observed.standing(*(point.curve.effect for point in points))
+        alone = self._observed.conditioned(*(point.curve.effect for point in points))
         total = 0.0
         for point in points:
             others = alone
             for other in points:
-                others = others if other is point else others.beside(other)
+                others = others if other is point else others.in_presence_of(other)
             any_strength = another and self._any_strength(point.curve.effect)
             total += log_prior(others, point, another=another, any_strength=any_strength)
         return total

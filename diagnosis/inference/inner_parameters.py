@@ -21,7 +21,7 @@ from .discrepancy import only
 from .inference import Hypothesis
 from .observed import Observed, Point
 from .search import from_middle, slopes_of
-from .seen import Responder, Seen, Whitener
+from .seen import FitTarget, Responder, Whitener
 
 _SD = 1.0 / math.sqrt(3.0)  # of what is even over a range, in halves of it
 
@@ -37,7 +37,7 @@ def with_inner_open(
         respond: asks the forward model.
         whitener: of its responses.
     """
-    seen = Seen(observed=replace(observed, given=()), respond=respond, whitener=whitener)
+    seen = FitTarget(observed=replace(observed, given=()), respond=respond, whitener=whitener)
     opened = {
         effect: _opened(curve, hypothesis.strengths[effect][0], seen) for effect, curve in hypothesis.variants.items()
     }
@@ -45,11 +45,11 @@ def with_inner_open(
         return hypothesis
     strengths = dict(hypothesis.strengths)
     for effect, curve in opened.items():
-        beside = observed.standing(*hypothesis.effects)
+        beside = observed.conditioned(*hypothesis.effects)
         for other, its in opened.items():
             if other != effect:
                 strength, level = hypothesis.strengths[other][0], hypothesis.levels[other]
-                beside = beside.beside(Point(curve=its, strength=strength, level=level))
+                beside = beside.in_presence_of(Point(curve=its, strength=strength, level=level))
         fit = fit_curve(beside, curve, levels=only(hypothesis.levels[effect]))
         # the straight line says how much stays open; the strength itself is known from the law as it bends
         value, low, high = hypothesis.strengths[effect]
@@ -58,7 +58,7 @@ def with_inner_open(
     return replace(hypothesis, strengths=strengths)
 
 
-def _opened(curve: Curve, strength: float, seen: Seen) -> Curve:
+def _opened(curve: Curve, strength: float, seen: FitTarget) -> Curve:
     """A curve with what its inner parameters may change among what the effect does by chance; itself where none is refined."""
     variant = curve.variant
     inner = [item for item in variant.fitted if item.name in variant.parameters]

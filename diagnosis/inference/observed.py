@@ -43,7 +43,7 @@ class Observed:
     their mean shows and each kind of what their frames differ by apart (None: `series`): a law of a known course leaves no
     more in one than it moves there; steady: what of an effect a steady law could leave (None: all of it); root (probe,):
     standard deviations of the probes in the units of the first (None: 1); given: effects that the twin has, which are still
-    in the residual: `standing` takes them off.
+    in the residual: `conditioned` takes them off.
     """
 
     residual: NDArray[np.float64]
@@ -85,20 +85,20 @@ class Observed:
         """Whether the twin has an effect."""
         return bool(self._free([effect]))
 
-    def standing(self, *free: str) -> "Observed":
+    def conditioned(self, *free: str) -> "Observed":
         """The same with the effects that the twin has as strong as it has them, but those in `free`, which are not there."""
         left_out = self._free(free)
         if left_out not in self._standing:
             found = replace(self, given=()) if self.given else self
             for point in self.given:
                 if point.curve.effect not in left_out:
-                    found = found.beside(point)
+                    found = found.in_presence_of(point)
             self._standing[left_out] = found
         return self._standing[left_out]
 
-    def over_none(self, *free: str) -> float:
+    def log_evidence_without(self, *free: str) -> float:
         """Log evidence, over all that the twin has and nothing else, of all that but the effects in `free`."""
-        return self.standing(*free).log_likelihood - self.standing().log_likelihood
+        return self.conditioned(*free).log_likelihood - self.conditioned().log_likelihood
 
     def off_by(self, level: float) -> "Observed":
         """The same with laws of the effects that the twin has off by another level."""
@@ -130,7 +130,7 @@ class Observed:
             root=self.units * root,
         )
 
-    def beside(self, point: Point) -> "Observed":
+    def in_presence_of(self, point: Point) -> "Observed":
         """What is left once an effect stands there, its strength about as it says."""
         left, of_strength = self._less(point)
         free = point.strength_sd * of_strength[:, None]
@@ -138,7 +138,7 @@ class Observed:
             return left
         return replace(left, nuisances=left.nuisances.over(np.ones(len(free)), free, csc_array((0, len(free)))))
 
-    def told_of_strength(self, point: Point) -> tuple[float, float]:
+    def score_and_information(self, point: Point) -> tuple[float, float]:
         """Slope and curvature, >= 0, of the log likelihood in the logarithm of a point's strength, about that strength."""
         left, of_strength = self._less(point)
         both = np.stack([left.residual, of_strength])
@@ -182,7 +182,7 @@ class Observed:
         known = all(point.curve.variant.course for point in points)
         parts = self.aspects if known and self.aspects is not None else self.series
         squares = [
-            self.squares_by_part(
+            self.power_by_part(
                 replace(point.curve, spread=None, jitter=None)
                 if known and point.curve.variant.course == "random"
                 else point.curve,
@@ -193,7 +193,7 @@ class Observed:
         ]
         return parts, np.sum(squares, axis=0)
 
-    def squares_by_part(self, curve: Curve, strength: float, parts: NDArray[np.intp]) -> NDArray[np.float64]:
+    def power_by_part(self, curve: Curve, strength: float, parts: NDArray[np.intp]) -> NDArray[np.float64]:
         """The square of `length` in each of some parts (part,), were the curve (in these units) to move that part and no other.
 
         So a nuisance that parts share brings nothing into those that the curve does not move.

@@ -121,9 +121,9 @@ def _settled(
 def _beside_first(observed: Observed, point: Point, other: str) -> tuple[float, Observed]:
     """What a first effect leaves to another, and its log evidence over none without the prior; neither is there by the twin."""
     both = (point.curve.effect, other)
-    alone = observed.standing(*both)
-    beside = alone.beside(point)
-    return observed.over_none(*both) + beside.log_likelihood - alone.log_likelihood, beside
+    alone = observed.conditioned(*both)
+    beside = alone.in_presence_of(point)
+    return observed.log_evidence_without(*both) + beside.log_likelihood - alone.log_likelihood, beside
 
 
 def _beside(beside: Observed, curves: Sequence[Curve]) -> CurveFit:
@@ -136,7 +136,7 @@ def _beside(beside: Observed, curves: Sequence[Curve]) -> CurveFit:
     return replace(best, log_evidence=total, share=total - best.log_evidence)
 
 
-def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
+def log_odds_of_leak(observed: Observed, pair: Pair) -> tuple[str, float]:
     """Which of two moves the probes more, and how much likelier its law's leaving the other's shape is than that effect: log of it.
 
     The likelihood of the weaker one's strength is integrated over what such a law leaves in place of that effect's prior. Of that
@@ -158,10 +158,10 @@ def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
     shares = np.exp(shares - np.logaddexp.reduce(shares))
     levels = map(at_most_off, LEVELS.levels)
     acting = observed.acting([first.point])
-    return strong, left_in_place(observed, second, acting, list(zip(shares, levels, strict=False)), shape=left)
+    return strong, log_odds_of_leak_in(observed, second, acting, list(zip(shares, levels, strict=False)), shape=left)
 
 
-def left_in_place(
+def log_odds_of_leak_in(
     observed: Observed,
     second: CurveFit,
     acting: tuple[NDArray[np.intp], NDArray[np.float64]],
@@ -181,7 +181,7 @@ def left_in_place(
     """
     shape = second if shape is None else shape
     parts, squares = acting
-    own = observed.squares_by_part(shape.curve, second.best, parts)
+    own = observed.power_by_part(shape.curve, second.best, parts)
     # of what it would have to leave in a part over what it does there, as much as the effect shows there; a part that a law does not
     # move is left as it is to a standard deviation
     ratio = max(math.sqrt(float(np.sum(own**2 / (squares + 1.0))) / max(float(np.sum(own)), 1e-12)), 1e-12)
@@ -199,9 +199,9 @@ def left_in_place(
 def log_prior(observed: Observed, point: Point, *, another: bool = False, any_strength: bool = False) -> float:
     """Log of what a point takes of the prior: its curve's, how often laws (of `another` kind) are off by its level, its strengths'.
 
-    Strengths are even in their logarithm. The Gaussian that `Observed.beside` frees them by is no prior: what it gives is taken off,
-    and the integral over the reach put in its place. About a point, where the likelihood is highest, that falls to both sides, but at
-    an end of the reach.
+    Strengths are even in their logarithm. The Gaussian that `Observed.in_presence_of` frees them by is no prior: what it gives is
+    subtracted, and the integral over the reach put in its place. About a point, where the likelihood is highest, that falls to both
+    sides, but at an end of the reach.
 
     Args:
         observed: what all other effects leave, without this one.
@@ -210,7 +210,7 @@ def log_prior(observed: Observed, point: Point, *, another: bool = False, any_st
         any_strength: that the curve is tried at, none more plausible than another.
     """
     curve, variant = point.curve, point.curve.variant
-    slope, curvature = observed.told_of_strength(point)
+    slope, curvature = observed.score_and_information(point)
     width = 1.0 / (curvature + point.strength_sd**-2)
     free = 0.5 * (slope**2 * width + math.log(width / point.strength_sd**2))
     strengths = refined(curve.log_strengths(), point.strength, math.sqrt(width))

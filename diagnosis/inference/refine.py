@@ -21,7 +21,7 @@ from .discrepancy import USUAL_LEVEL
 from .inference import UNKNOWN, Hypothesis
 from .observed import Observed, Point
 from .search import searched
-from .seen import Blocks, Responder, Seen, Whitener
+from .seen import Blocks, FitTarget, Responder, Whitener
 
 _MOST_EFFECTS = 4
 # of the best on the grid over none: refinement adds some fifth to it, and far more is needed to be named
@@ -53,7 +53,7 @@ def refine(
         whitener: of responses.
         blocks: of series that share local nuisances; the search asks those that tell most. None: it asks all.
     """
-    whole = Seen(observed=observed, respond=respond, whitener=whitener, blocks=blocks)
+    whole = FitTarget(observed=observed, respond=respond, whitener=whitener, blocks=blocks)
     refinement = _Refinement(whole, curves)
     for task in tasks_of(hypotheses):
         refinement.run(task)
@@ -81,7 +81,7 @@ class Task:
 class _Refinement:
     """Variants found so far; what stands beside an effect is taken as it was found last."""
 
-    def __init__(self, whole: Seen, curves: Sequence[Curve]) -> None:
+    def __init__(self, whole: FitTarget, curves: Sequence[Curve]) -> None:
         self._whole = whole
         self._curves = curves
         self._closer: dict[str, CurveFit] = {}
@@ -91,9 +91,9 @@ class _Refinement:
         """Refine an effect; one that is not clearly seen, or beside which the other one of its pair is not, is left as it is."""
         seen = self._standing(task)
         if task.beside is not None:
-            if task.moves_more and not self._clear(task.beside.curve.effect, seen.beside(self._last(task.own))):
+            if task.moves_more and not self._clear(task.beside.curve.effect, seen.in_presence_of(self._last(task.own))):
                 return
-            seen = seen.beside(self._last(task.beside))
+            seen = seen.in_presence_of(self._last(task.beside))
         # brought nearer alone already; the lesser of two is sought anew beside the other, which it may have stood for
         known = self._closer.get(task.effect) if task.moves_more else None
         if known is not None:
@@ -122,17 +122,17 @@ class _Refinement:
         if best is not None and best.curve.variant.beside is None:
             self._closer[task.effect] = best
 
-    def _standing(self, task: Task) -> Seen:
+    def _standing(self, task: Task) -> FitTarget:
         """What a task's effects are fitted to: the twin has its effects but these."""
         effects = [task.effect] if task.beside is None else [task.effect, task.beside.curve.effect]
-        return replace(self._whole, observed=self._whole.observed.standing(*effects))
+        return replace(self._whole, observed=self._whole.observed.conditioned(*effects))
 
     def _last(self, grid: Point) -> Point:
         """An effect as it was found last; as the grid has it before."""
         known = self._closer.get(grid.curve.effect)
         return grid if known is None else known.point
 
-    def _clear(self, effect: str, seen: Seen) -> list[CurveFit]:
+    def _clear(self, effect: str, seen: FitTarget) -> list[CurveFit]:
         """Fits of an effect's curves of the grid that show it clearly."""
         fits = [seen.fit(curve) for curve in self._curves if curve.effect == effect]
         return [fit for fit in fits if _separation(fit, seen) >= SEEN_FROM]
@@ -143,7 +143,7 @@ def _with(fit: CurveFit, **changed: Any) -> CurveFit:
     return replace(fit, curve=replace(fit.curve, variant=replace(fit.curve.variant, **changed)))
 
 
-def _separation(fit: CurveFit, seen: Seen) -> float:
+def _separation(fit: CurveFit, seen: FitTarget) -> float:
     """Of a fit from none, its law taken as exact."""
     response = fit.curve.response(fit.best) / seen.observed.units
     return math.sqrt(max(float(response @ seen.observed.nuisances.solve(response)), 0.0))

@@ -11,7 +11,7 @@ from ...generator.effects import EFFECTS, Parameter
 from ..model.changes import Variant
 from ..model.curves import Curve
 from .curve_fits import CurveFit
-from .seen import Seen
+from .seen import FitTarget
 
 _CENTRINGS, _CENTRED = 3, 0.15  # times that nodes are laid anew, and logarithm of the strength that needs none
 _ROUNDS = 10  # of a search, at the most: it ends where nothing is gained
@@ -27,7 +27,7 @@ _UP_TO = (0.75, 1.0)  # where more cannot be asked: the spectrum ends a tenth ab
 _ITSELF = (1.0,)  # where the response grows in proportion
 
 
-def searched(start: CurveFit, seen: Seen) -> tuple[Variant, NDArray[np.float64]] | None:
+def searched(start: CurveFit, seen: FitTarget) -> tuple[Variant, NDArray[np.float64]] | None:
     """A variant brought to where the probes want it, with its responses (strength, probe) to all; None: it cannot be asked.
 
     start: from its variant and its best strength; what it does by chance stays.
@@ -35,10 +35,10 @@ def searched(start: CurveFit, seen: Seen) -> tuple[Variant, NDArray[np.float64]]
     variant, like = start.curve.variant, start.curve
     refined = EFFECTS[variant.effect].grid.refined
     inner = [item for item in variant.fitted if refined and item.name in variant.parameters]
-    some = seen.where_told(start)
+    some = seen.most_informative(start)
     cut = some is not seen
     found = _Search(like, some).run(variant, start.best, _in_turn(inner))
-    while inner and found is not None and (closer := some.more_exact()) is not None:
+    while inner and found is not None and (closer := some.at_smaller_level()) is not None:
         # a law that is more exact than usual is brought nearer than one that is off could tell
         nearer = _Search(like, closer).run(found.variant, found.fit.best, [inner], slopes=found.slopes)
         if nearer is None or some.evidence(nearer.fit.curve) < some.evidence(found.fit.curve) + _ENOUGH:
@@ -51,7 +51,7 @@ def searched(start: CurveFit, seen: Seen) -> tuple[Variant, NDArray[np.float64]]
     return None if found is None else _centred(found, like, seen)
 
 
-def _centred(found: "_Found", like: Curve, seen: Seen) -> tuple[Variant, NDArray[np.float64]] | None:
+def _centred(found: "_Found", like: Curve, seen: FitTarget) -> tuple[Variant, NDArray[np.float64]] | None:
     """A variant at nodes about the strength that all probes want, with its responses (strength, probe).
 
     A response that saturates is known near its nodes only: they are laid where the strength turns out to be.
@@ -101,7 +101,7 @@ class _Found:
 class _Search:
     """Inner parameters and strength of one variant brought to where the probes want them; like: a curve of the effect."""
 
-    def __init__(self, like: Curve, seen: Seen) -> None:
+    def __init__(self, like: Curve, seen: FitTarget) -> None:
         self._like = seen.cut(like)
         self._seen = seen
         # one strength tells the others where the response grows in proportion
@@ -205,7 +205,7 @@ class Slopes:
         return Slopes(self.names, rows, strength)
 
 
-def slopes_of(curve: Curve, inner: Sequence[Parameter], strength: float, seen: Seen) -> Slopes:
+def slopes_of(curve: Curve, inner: Sequence[Parameter], strength: float, seen: FitTarget) -> Slopes:
     """What small steps of the inner parameters do to a curve's response; those that cannot be asked are left out."""
     variant = curve.variant
     at = np.asarray(curve.response(strength))
@@ -234,7 +234,7 @@ def _plausible(here: CurveFit) -> float:
     return min(max(here.best, here.curve.variant.low), here.curve.variant.high)
 
 
-def _newton(here: CurveFit, slopes: Slopes, seen: Seen) -> tuple[dict[str, float], float]:
+def _newton(here: CurveFit, slopes: Slopes, seen: FitTarget) -> tuple[dict[str, float], float]:
     """Steps of the inner parameters, each in half of its range, towards where the probes want them, and what they should gain.
 
     Least squares in the parameters and the strength together, responses taken as straight lines near here, the law off

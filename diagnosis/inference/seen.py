@@ -61,7 +61,7 @@ class Blocks:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Seen:
+class FitTarget:
     """What one effect is fitted to, beside others, and how the forward model is asked for more of it.
 
     Its curves are whitened and in the units of the first probes. Fields: observed; respond: the forward model; whitener of its
@@ -76,11 +76,11 @@ class Seen:
     wanted: NDArray[np.bool_] | None = None
     level: float = USUAL_LEVEL
 
-    def beside(self, point: Point) -> "Seen":
+    def in_presence_of(self, point: Point) -> "FitTarget":
         """The same once another effect stands there."""
-        return replace(self, observed=self.observed.beside(point))
+        return replace(self, observed=self.observed.in_presence_of(point))
 
-    def where_told(self, fit: CurveFit) -> "Seen":
+    def most_informative(self, fit: CurveFit) -> "FitTarget":
         """The same of the series that tell most of a fitted curve; itself where nearly all are needed."""
         if self.blocks is None:
             return self
@@ -112,7 +112,7 @@ class Seen:
         """A curve of these probes, fitted with its law off by the level."""
         return fit_curve(self.observed, curve, levels=only(self.level))
 
-    def more_exact(self) -> "Seen | None":
+    def at_smaller_level(self) -> "FitTarget | None":
         """The same with laws off by the level two below, or exact; None: they are exact."""
         below = sum(level < self.level for level in LEVELS.levels)
         return replace(self, level=LEVELS.levels[max(below - 2, 0)]) if below else None

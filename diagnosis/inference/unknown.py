@@ -29,7 +29,7 @@ class Families:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Beyond:
+class ExtraVariance:
     """What a residual shows beyond what may vary.
 
     Fields: log_evidence over none of an unknown effect; place: family of probes in which it is seen most; length: root of the sum of
@@ -41,7 +41,7 @@ class Beyond:
     length: float
 
 
-def beyond(observed: Observed, families: Families, *, left_by_laws: bool = False) -> Beyond:
+def fit_extra_variance(observed: Observed, families: Families, *, left_by_laws: bool = False) -> ExtraVariance:
     """What a residual shows beyond what may vary, in families of probes; left_by_laws: in none in which one effect alone shows.
 
     Every family may have an extra variance tau^2, log-uniform over a grid; the evidence is that of the best combination (each
@@ -97,7 +97,7 @@ def beyond(observed: Observed, families: Families, *, left_by_laws: bool = False
     length = math.sqrt(
         sum(float(size) * float(np.sum(units[part] ** 2)) for size, part in zip(tau2, members, strict=True))
     )
-    return Beyond(log_evidence=best - base, place=families.names[place], length=length)
+    return ExtraVariance(log_evidence=best - base, place=families.names[place], length=length)
 
 
 def _price(shown: int, count: int) -> float:

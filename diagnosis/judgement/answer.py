@@ -12,7 +12,7 @@ from ...results import Result, Table, axes_or_new, frame, plain
 from ..inference.inference import Hypothesis
 from ..problem.known_effects import with_found
 from ..problem.problem import Problem
-from ..session.coarse import parameters_in_pixels, unseen_in_squares
+from ..session.binning import lost_by_binning, parameters_in_pixels
 from .held_out import Gap
 
 if TYPE_CHECKING:
@@ -199,7 +199,7 @@ def in_pixels(diagnosis: Diagnosis, *, twin: Twin, factor: int) -> Diagnosis:
     """A diagnosis made with squares of pixels, in terms of the panel's pixels.
 
     Args:
-        diagnosis: of the coarser session.
+        diagnosis: of the binned session.
         twin: the panel's own, calibrated from the same series.
         factor: pixels along each side of a square.
     """
@@ -208,7 +208,7 @@ def in_pixels(diagnosis: Diagnosis, *, twin: Twin, factor: int) -> Diagnosis:
     )
     causes = []
     for cause in diagnosis.causes:
-        share = EFFECTS[cause.effect].strength.pixels_per_square(factor)
+        share = EFFECTS[cause.effect].strength.pixels_per_bin(factor)
         value, low, high = cause.strength
         causes.append(
             replace(
@@ -227,7 +227,7 @@ def in_pixels(diagnosis: Diagnosis, *, twin: Twin, factor: int) -> Diagnosis:
         added=added,
         causes=tuple(causes),
         twin=replace(twin, effects=with_found(twin.effects, added)),
-        not_tested={**diagnosis.not_tested, **unseen_in_squares()},
+        not_tested={**diagnosis.not_tested, **lost_by_binning()},
         notes=(*diagnosis.notes, text),
     )
 

@@ -105,22 +105,22 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
     fits = fit_effects(observed, whitened)
     for effect in (effect for effect, entry in EFFECTS.items() if entry.in_some_series and not observed.has(effect)):
         of_effect = [fit for fit in fits if fit.curve.effect == effect]
-        part = in_some_series(observed.standing(), of_effect, problem.series_of)
+        part = in_some_series(observed.conditioned(), of_effect, problem.series_of)
         if part is not None:
             problem = problem.in_series(part.variant, part.series, part.log_prior)
             more = whitening.curves(problem.curves[len(whitened) :])
             whitened, fits = (*whitened, *more), [*fits, *fit_effects(observed, more)]
 
-    def weigh(seen: Sequence[tuple[Observed, Sequence[CurveFit]]], *, rests: bool) -> tuple[Hypothesis, ...]:
+    def weigh(seen: Sequence[tuple[Observed, Sequence[CurveFit]]], *, misfits: bool) -> tuple[Hypothesis, ...]:
         return weigh_hypotheses(
             seen,
             families=problem.families,
             of_catalogue=len(EFFECTS),
-            rests=rests,
+            misfits=misfits,
             beside=[curve for curve in whitened if curve.variant.beside is not None],
         )
 
-    first = weigh([(observed, fits)], rests=False)
+    first = weigh([(observed, fits)], misfits=False)
     likeliest = _likeliest(first)
     if likeliest is not None:
         tell("nuisances beside the likeliest explanation")
@@ -140,7 +140,7 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
     whitened = (*whitened, *whitening.curves(problem.curves[len(whitened) :]))
     alone = [curve for curve in whitened if curve.variant.beside is None]
     fits = fit_effects(observed, alone)
-    nearer = _likeliest(weigh([(observed, fits)], rests=False)) if closer else None
+    nearer = _likeliest(weigh([(observed, fits)], misfits=False)) if closer else None
     if nearer is not None:
         tell("nuisances beside it, as refinement found it")
         problem = problem.with_nuisances_beside(_applied_everywhere(nearer))
@@ -152,7 +152,7 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
     if observed.given:
         levels = [observed.off_by(level) for level in LEVELS.up_to(FARTHEST_LEVEL).levels]
         seen = [(one, fit_effects(one, alone)) for one in levels]
-    hypotheses = weigh(seen, rests=True)
+    hypotheses = weigh(seen, misfits=True)
     hypotheses = tuple(
         with_inner_open(item, observed=observed, respond=problem.respond, whitener=whitening)
         if item.probability > _WORTH_LISTING
@@ -240,7 +240,7 @@ def verdict_of(hypotheses: tuple[Hypothesis, ...]) -> Verdict:
     elif leading.effects == (UNKNOWN,):
         word = "unknown_effect"
     elif core == set(leading.effects):
-        word = "explained_in_part" if leading.rest else "explained"
+        word = "explained_in_part" if leading.misfit else "explained"
     else:
         total = 0.0
         for item in hypotheses:

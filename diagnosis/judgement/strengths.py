@@ -182,7 +182,7 @@ def strengths_on(
             if curve.by_chance_alone:
                 continue  # the strength is that of all probes
             others = {other: (leading.variants[other], strengths[other]) for other in effects if other != effect}
-            rest = replace(part, residual=problem.left_by(others, without=had)[fit]).standing()
+            rest = replace(part, residual=problem.left_by(others, without=had)[fit]).conditioned()
             own = replace(curve.of_probes(fit), spread=None)
             strengths[effect] = fit_curve(rest, own, levels=only(USUAL_LEVEL)).best
     return strengths

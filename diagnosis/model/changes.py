@@ -19,7 +19,7 @@ from ...generator.effects.effect import Displacement, Parameter, Placement
 from ...generator.line.series_request import SeriesRequest
 from ...generator.line.twin import Estimate, SpectralPosterior, SpreadEstimate, Twin
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS
-from ..session.coarse import in_squares
+from ..session.binning import per_bin
 
 _MOST_VARIANTS = 4
 _IN_MAPS = ("maps", "maps of beams")  # effects that look otherwise where calibration has seen them
@@ -160,7 +160,7 @@ class Change:
                 return True
         return False
 
-    def beside(self, other: "Change") -> "Change | None":
+    def in_presence_of(self, other: "Change") -> "Change | None":
         """A nuisance's step once effects have been found; None: it is a little of one of these.
 
         other: the base twin with these effects.
@@ -247,7 +247,7 @@ def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
     What calibration takes in whole (a constant kV offset, filtration, gain map, more noise) is no gap and is tried as setting in
     after it; what acts on objects alone is the same either way; the rest is tried both ways.
     """
-    strength, *others = (in_squares(item, side) for item in effect.parameters)
+    strength, *others = (per_bin(item, side) for item in effect.parameters)
     inner = [item for item in others if item.fitted]
     choices: list[dict[str, float]] = [{}]
     for item in inner:
@@ -271,7 +271,7 @@ def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
     if effect.grid.variants:
         choices = [
             {item.name: item.default for item in inner}
-            | {name: value / effect.pixels_per_square(name, side) for name, value in choice.items()}
+            | {name: value / effect.pixels_per_bin(name, side) for name, value in choice.items()}
             for choice in effect.grid.variants
         ]
     signs = (1.0, -1.0) if strength.signed else (1.0,)
@@ -454,7 +454,7 @@ def always_a_little(*, side: int = 1) -> list[Variant]:
             continue
         some = variants_of(effect, side=side)[0]
         for inner, strength in little.amounts:
-            own = {name: value / effect.pixels_per_square(name, side) for name, value in inner.items()}
+            own = {name: value / effect.pixels_per_bin(name, side) for name, value in inner.items()}
             label = ", ".join([little.name, *(f"{name} {value:.3g}" for name, value in own.items())])
             parameters = {**some.parameters, **own}
             result.append(replace(some, name=label, parameters=parameters, since="always", strengths=(strength,)))

@@ -14,7 +14,7 @@ from ..session.even_maps import full_size
 from .nuisance_columns import Columns, nuisances_of_series
 from .other_scenes import OtherScenes
 from .series_probes import SeriesProbes
-from .surroundings import light_let_in
+from .surroundings import border_inflow
 
 _LEAST_FACTOR = 1e-3  # standard deviations of a probe, below which a nuisance is none
 
@@ -84,9 +84,9 @@ class AskedAgain:
             if not any(asked[row].failed for row in (*rows, *range(len(changes), len(asked))))
         }
 
-    def let_in(self, effect: AppliedEffect) -> NDArray[np.float64] | None:
-        """What borders may let in of an effect by chance, see `light_let_in`."""
-        return light_let_in(self.session, [one.probes for one in self.series], effect)
+    def border_inflow(self, effect: AppliedEffect) -> NDArray[np.float64] | None:
+        """What borders may let in of an effect by chance, see `border_inflow`."""
+        return border_inflow(self.session, [one.probes for one in self.series], effect)
 
     def factors_with(self, effects: Sequence[AppliedEffect]) -> Columns:
         """Responses (probe,) to nuisances by name where effects have been found; the base's where they change nothing.
@@ -97,7 +97,9 @@ class AskedAgain:
         columns = {name: column.copy() for name, column in self.factors.items()}
         if found.failed:
             return columns
-        beside = {step.label: change for step in self.steps if (change := step.beside(found.change)) is not None}
+        beside = {
+            step.label: change for step in self.steps if (change := step.in_presence_of(found.change)) is not None
+        }
         asked = {label: self.session.ask(change) for label, change in beside.items()}
         for one, place in zip(self.series, self._places, strict=True):
             for name, column in self._of_series(one, found, asked).items():

@@ -45,7 +45,7 @@ from .other_scenes import NO_SCENES, OtherScenes, other_scenes
 from .problem import Problem, SeriesView, read_exactly
 from .series_block import SeriesBlock, by_chance, jitter_of, series_block
 from .series_probes import MeanFrame, mean_frame, series_probes
-from .surroundings import light_let_in
+from .surroundings import border_inflow
 
 _OWN_NOISE = "the flats are single frames: how much noise there is, is known only from these same series"
 # step in spectral parameters, over the posterior's standard deviation, about a point that the session wants
@@ -400,8 +400,8 @@ def _as_given(effect: AppliedEffect, done: NDArray[np.float64], session: Session
         high=strength,
         strengths=(strength,),
     )
-    let_in = light_let_in(session, [part.probed.probes for part in parts], effect)
-    curve = Curve(variant=variant, responses=done[None, :], spread=let_in)
+    inflow = border_inflow(session, [part.probed.probes for part in parts], effect)
+    curve = Curve(variant=variant, responses=done[None, :], spread=inflow)
     level = USUAL_LEVEL if effect.law_sd is None else min(effect.law_sd, FARTHEST_LEVEL)
     # found without an interval, or stated by hand: as intervals of strengths are widened for real laws
     sd = EFFECTS[effect.id].reading.law_sd if effect.strength_sd is None else effect.strength_sd
@@ -478,7 +478,7 @@ def _curves(
             missing.setdefault(variant.effect, failed)
             continue
         own = responses[list(rows)] + done.get(variant.effect, 0.0)
-        spread = light_let_in(session, probes, variant.applied(variant.strengths[0]))
+        spread = border_inflow(session, probes, variant.applied(variant.strengths[0]))
         if spread is None:
             spread = by_chance(variant, blocks, rows[0], readout_ms)
         # a wandering output shifts levels by chance even where too few frames show its noise

@@ -202,8 +202,8 @@ class Problem:
             onset = variant.effect, variant.since
             alike = [item for item in self.curves if (item.effect, item.variant.since) == onset]
             like = next((item for item in alike if item.variant.name == variant.refined_from), alike[0])
-            let_in = self._open.let_in(variant.applied(variant.strengths[-1]))
-            spread = like.spread if let_in is None else let_in
+            inflow = self._open.border_inflow(variant.applied(variant.strengths[-1]))
+            spread = like.spread if inflow is None else inflow
             curves.append(replace(like, variant=variant, responses=responses, spread=spread))
         return replace(self, curves=(*self.curves, *curves))
 

@@ -11,7 +11,7 @@ from ..model.responses import SessionModel
 from .series_probes import SeriesProbes
 
 
-def light_let_in(
+def border_inflow(
     session: SessionModel, series: Sequence[SeriesProbes], effect: AppliedEffect
 ) -> NDArray[np.float64] | None:
     """What an effect may let in by chance (probe, placement of a scene), a unit of its strength; None: it brings nothing in.

@@ -216,7 +216,7 @@ def rest_text(diagnosis: Diagnosis) -> str:
     told = f"; these laws seem to be off here: {', '.join(off)}" if off else ""
     left = leading[0].left if leading else ()
     place = f", most in the {_place_text(left[0])}" if left else ""
-    return f" The law leaves a rest that is no noise{place}{told}."
+    return f" The law leaves a misfit that is no noise{place}{told}."
 
 
 def task_text(task: Mapping[str, Any]) -> str:

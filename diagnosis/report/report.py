@@ -124,7 +124,7 @@ def _headline_of_verdict(diagnosis: Diagnosis) -> str:
         names = [title for title, _ in rivals(diagnosis)[:3]]
         return _sentence(f"{' or '.join(names)}: these data cannot distinguish them")
     named = _sentence(" and ".join(f"{title_of(cause.effect)}, {strength_text(cause)}" for cause in diagnosis.leading))
-    return f"{named}: its law leaves a rest" if diagnosis.verdict == "explained_in_part" else named
+    return f"{named}: its law leaves a misfit" if diagnosis.verdict == "explained_in_part" else named
 
 
 def _sentence(text: str) -> str:

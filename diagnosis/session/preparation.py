@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...acquisition.acquisition_io import AcquisitionFile, Series
-from ...acquisition.coarser import coarser
+from ...acquisition.binned_frames import binned
 from ...acquisition.cut_off import share_of_zeros, without_cut_off_darks
 from ...acquisition.series_roles import calibrating_names
 from ...calibration.calibrate import calibrate_twin
@@ -18,8 +18,8 @@ from ...checks.labels import LabelCheck, check_labels
 from ...checks.readings import Explained
 from ...errors import FitError, InputError, RaytwinError
 from ...generator.line.twin import Twin
-from .coarse import LEAST_SIDE, coarse_factor
-from .coarse_twin import twin_in_squares
+from .binned_twin import binned_twin
+from .binning import LEAST_SIDE, bin_factor
 from .origin import made_of
 
 _OF_THIS_SESSION = (
@@ -37,7 +37,7 @@ class PreparedSession:
     twin; calibrated_elsewhere (the twin was given, and none of these series is in it); contradicted (labels that frames contradict,
     whose series are left out); findings (labels that frames contradict, whose series are not); other_findings (numbers that stop
     early, flats that fit no spectrum); left_out (series that are not used, each with the reason); notes (how the session is looked
-    at, and what calibration took in); factor (pixels along each side of the squares that acquisition and twin have as pixels);
+    at, and what calibration took in); factor (pixels along each side of a bin);
     all_pixels (the same series with all pixels); ends_at_zero (names of lit series whose numbers go down to 0 and not below);
     spectral_point (parameter,): where the twin's spectral nuisances are taken as linear (None: at its best parameters).
     """
@@ -77,7 +77,7 @@ def prepare_session(
 ) -> PreparedSession:
     """Check a session's labels, take out what cannot be used, and calibrate its twin where none was given.
 
-    Frames of more than LARGEST_PIXELS become means of squares of pixels, and a given twin that of such squares. Where series whose
+    Frames of more than LARGEST_PIXELS are binned, and a given twin with them. Where series whose
     labels are contradicted cannot calibrate, they are left out.
 
     Args:
@@ -101,9 +101,9 @@ def prepare_session(
     all_pixels = replace(all_pixels, series=tuple(item for item in every if item.name not in wrong))
     if not all_pixels.series:
         raise _nothing_left(acquisition, left_out, contradicted)
-    factor = coarse_factor(all_pixels.series[0].shape)
-    twin = None if twin is None else twin_in_squares(twin, factor)
-    acquisition = coarser(all_pixels, factor)
+    factor = bin_factor(all_pixels.series[0].shape)
+    twin = None if twin is None else binned_twin(twin, factor)
+    acquisition = binned(all_pixels, factor)
     found = _checked_labels(acquisition, twin, progress=progress)
     left_out += [f"{name}: {reason}" for name, reason in found.unusable.items()]
     kept = tuple(item for item in acquisition.series if item.name not in found.unusable)

@@ -84,7 +84,7 @@ class Parameter:
         if self.log and not (self.low > 0 and not self.signed):
             raise InputError(f"parameter {self.name}", received=self.low, expected="above 0 and unsigned, for log")
 
-    def pixels_per_square(self, side: int) -> float:
+    def pixels_per_bin(self, side: int) -> float:
         """By what a number found in squares of side x side pixels is multiplied to be that of pixels."""
         share: float = float(side) ** abs(self.pixel_power)
         return share if self.pixel_power >= 0.0 else 1.0 / share
@@ -221,7 +221,7 @@ class Effect:
             diagnosis tries both. in_some_series: it may act in some series only, such as those on a moving belt.
         absorbed: one of ABSORBED: what calibration takes in of one that was always there.
         shows, reading, grid, variation, images: see there.
-        lost_in_squares: why it cannot be seen in squares of pixels; empty: it can.
+        lost_by_binning: why it cannot be seen in squares of pixels; empty: it can.
         always_a_little: what most lines have of it, if any; placement: of one that displaces scenes; mean_shift: of one that does
             other things to a scene, how far it displaces that on average, which registration finds.
         worked_in: (twin, strength) -> the twin whose own numbers are those of a line with it, and warnings; None: it stays an effect.
@@ -249,7 +249,7 @@ class Effect:
     grid: Grid = Grid()
     variation: Variation = Variation()
     images: InImages = InImages()
-    lost_in_squares: str = ""
+    lost_by_binning: str = ""
     always_a_little: AlwaysALittle | None = None
     placement: Placement | None = field(default=None, repr=False)
     mean_shift: MeanShift | None = field(default=None, repr=False)
@@ -295,9 +295,9 @@ class Effect:
         """Onsets that the diagnosis tries."""
         return ("always", "calibration") if self.either_onset else (self.usual_onset,)
 
-    def pixels_per_square(self, name: str, side: int) -> float:
+    def pixels_per_bin(self, name: str, side: int) -> float:
         """By what a parameter found in squares of side x side pixels is multiplied to be that of pixels; 1 for others' names."""
-        return next((item.pixels_per_square(side) for item in self.parameters if item.name == name), 1.0)
+        return next((item.pixels_per_bin(side) for item in self.parameters if item.name == name), 1.0)
 
     def values(self, parameters: Mapping[str, float]) -> dict[str, float]:
         """All parameters by name; what is not given takes its default.

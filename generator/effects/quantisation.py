@@ -40,5 +40,5 @@ QUANTISATION = Effect(
     absorbed="noise",
     reading=Reading(probes=("codes",), sd=0.06),
     variation=Variation(random="offset"),
-    lost_in_squares="codes are lost where frames are averaged",
+    lost_by_binning="codes are lost where frames are averaged",
 )

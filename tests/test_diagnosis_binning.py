@@ -8,18 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from raytwin.acquisition.coarser import means_of_squares
+from raytwin.acquisition.binned_frames import means_of_bins
 from raytwin.cli import main
 from raytwin.diagnosis.model.changes import variants_of
 from raytwin.diagnosis.probes.registration import render_variance
-from raytwin.diagnosis.session import coarse
-from raytwin.diagnosis.session.coarse import LARGEST_PIXELS, LEAST_SIDE, coarse_factor, parameters_in_pixels
+from raytwin.diagnosis.session import binning
+from raytwin.diagnosis.session.binning import LARGEST_PIXELS, LEAST_SIDE, bin_factor, parameters_in_pixels
 from raytwin.generator.effects import EFFECTS
 
 
 @given(rows=st.integers(1, 5000), columns=st.integers(1, 5000))
 def test_the_factor_is_the_least_that_keeps_frames_small(rows, columns):
-    factor = coarse_factor((rows, columns))
+    factor = bin_factor((rows, columns))
     if min(rows, columns) >= LEAST_SIDE:
         assert min(rows, columns) // factor >= LEAST_SIDE
     if min(rows, columns) // (factor + 1) >= LEAST_SIDE:  # no long strip
@@ -37,15 +37,15 @@ def test_strengths_found_with_squares_are_those_of_the_pixels():
     shape = (800, 400)
     # lines: rms over the read noise
     rows, read = 0.5 * rng.standard_normal((shape[0], 1)), rng.standard_normal(shape)
-    small_rows = means_of_squares(np.broadcast_to(rows, shape), factor)
-    found = float(small_rows.std() / means_of_squares(read, factor).std())
+    small_rows = means_of_bins(np.broadcast_to(rows, shape), factor)
+    found = float(small_rows.std() / means_of_bins(read, factor).std())
     assert strength_in_pixels("row_noise", found, factor) == pytest.approx(0.5, rel=4 / math.sqrt(2 * 200))
     # a pattern from pixel to pixel: rms
-    found = float(means_of_squares(0.01 * read, factor).std())
+    found = float(means_of_bins(0.01 * read, factor).std())
     assert strength_in_pixels("gain_map_error", found, factor) == pytest.approx(0.01, rel=4 / math.sqrt(2 * 20_000))
     # single pixels: share of the squares that they spoil
     bad = rng.random(shape) < 0.001
-    found = float(np.mean(means_of_squares(bad, factor) > 0))
+    found = float(np.mean(means_of_bins(bad, factor) > 0))
     assert strength_in_pixels("bad_pixels", found, factor) == pytest.approx(float(bad.mean()), rel=0.02)
     # a displacement
     assert strength_in_pixels("misregistration", 0.5, factor) == 2.0
@@ -83,7 +83,7 @@ def test_a_large_panel_is_compared_in_squares_and_its_own_twin_improved(tmp_path
     session = tmp_path / "session.h5"
     words = ["--protocol", "short", "--seed", "31", "--size", "96", "--frames", "12", "--products", "1"]
     assert main(["lab", "--family", "none", "-o", str(session), *words, "--effect", "excess_noise=60@calibration"]) == 0
-    monkeypatch.setattr(coarse, "LARGEST_PIXELS", 48 * 48)
+    monkeypatch.setattr(binning, "LARGEST_PIXELS", 48 * 48)
     capsys.readouterr()
     assert main(["diagnose", str(session), "-o", str(tmp_path / "answer"), "--json"]) == 0
     printed = capsys.readouterr()
@@ -137,7 +137,7 @@ def test_a_plan_of_a_large_panel_is_in_its_own_pixels(tmp_path, capsys, monkeypa
     assert main(["lab", "--family", "none", "-o", str(session), *words]) == 0
     found = {}
     for name, largest in (("fine", 96 * 96), ("squares", 48 * 48)):
-        monkeypatch.setattr(coarse, "LARGEST_PIXELS", largest)
+        monkeypatch.setattr(binning, "LARGEST_PIXELS", largest)
         capsys.readouterr()
         assert main(["diagnose", str(session), "-o", str(tmp_path / name), "--plan", "--json"]) == 0
         found[name] = json.loads(capsys.readouterr().out)

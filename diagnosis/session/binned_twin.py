@@ -1,7 +1,7 @@
-"""A panel's twin with squares of pixels for pixels: what it expects of frames that were averaged over squares.
+"""A panel's twin with binned pixels: what it expects of frames that were averaged over square bins.
 
-Means of squares have a pixel's level, more quanta and less electronic noise; light that spreads over pixels spreads over less of a
-square. Numbers are not whole any more.
+Means of bins have a pixel's level, more quanta and less electronic noise; light that spreads over pixels spreads over less of a bin.
+Numbers are not whole any more.
 """
 
 import math
@@ -10,16 +10,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...acquisition.coarser import means_of_squares
+from ...acquisition.binned_frames import means_of_bins
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.line.twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, Twin, gaussian_spread
 from ...generator.spread.psf import blur_variance_share
 
 _MODEL = "sampled"
-_WIDEST = 8.0  # squares that light may spread over
+_WIDEST = 8.0  # bins that light may spread over
 
 
-def twin_in_squares(twin: Twin, factor: int) -> Twin:
+def binned_twin(twin: Twin, factor: int) -> Twin:
     """The twin of means over factor x factor pixels; rows and columns that fill no square are left out as of frames.
 
     With n = factor: gain, photon-transfer slope and DN a keV are 1 / n^2 of a pixel's, the electronic variance too; the spread is the
@@ -32,7 +32,7 @@ def twin_in_squares(twin: Twin, factor: int) -> Twin:
         twin: of the panel's pixels.
         factor: pixels along each side of a square, 1 or more.
 
-    Checked against: twins calibrated from averaged frames (tests/test_diagnosis_coarse_twin.py).
+    Checked against: twins calibrated from averaged frames (tests/test_diagnosis_binned_twin.py).
     """
     if factor == 1:
         return twin
@@ -57,10 +57,10 @@ def _maps(maps: DetectorMaps, factor: int) -> DetectorMaps:
     squares = bad[top : top + rows * factor, left : left + columns * factor].reshape(rows, factor, columns, factor)
     return replace(
         maps,
-        dark_DN=means_of_squares(maps.dark_DN, factor),
-        dark_DN_per_ms=means_of_squares(maps.dark_DN_per_ms, factor),
-        gain_relative=means_of_squares(maps.gain_relative, factor),
-        read_variance_DN2=means_of_squares(maps.read_variance_DN2, factor) / np.float32(factor**2),
+        dark_DN=means_of_bins(maps.dark_DN, factor),
+        dark_DN_per_ms=means_of_bins(maps.dark_DN_per_ms, factor),
+        gain_relative=means_of_bins(maps.gain_relative, factor),
+        read_variance_DN2=means_of_bins(maps.read_variance_DN2, factor) / np.float32(factor**2),
         bad_pixels=squares.max(axis=(1, 3)),
     )
 
@@ -100,7 +100,7 @@ def _level(level: Level, noise: NoiseModel, factor: int) -> Level:
         level,
         gain_DN=gain,
         photon_transfer_slope_DN=gain.times(left),
-        flat_shape=means_of_squares(level.flat_shape, factor),
+        flat_shape=means_of_bins(level.flat_shape, factor),
     )
 
 
@@ -112,10 +112,10 @@ def _spectral(spectral: SpectralPosterior, factor: int, *, pitch_known: bool) ->
     more = 2.0 * math.log(factor)
     moved = {"log_DN_per_keV": -more} | ({} if pitch_known else {"log_output": more})
 
-    def in_squares(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def per_bin(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(values + np.array([moved.get(name, 0.0) for name in spectral.names]))
 
-    return replace(spectral, samples=in_squares(spectral.samples), best=in_squares(spectral.best))
+    return replace(spectral, samples=per_bin(spectral.samples), best=per_bin(spectral.best))
 
 
 def _effect(item: AppliedEffect, factor: int) -> AppliedEffect:
@@ -126,7 +126,7 @@ def _effect(item: AppliedEffect, factor: int) -> AppliedEffect:
     values = effect.values(item.parameters)
     found = dict(item.parameters)
     for parameter in effect.parameters:
-        share = parameter.pixels_per_square(factor)
+        share = parameter.pixels_per_bin(factor)
         if share != 1.0:
             found[parameter.name] = min(values[parameter.name] / share, parameter.most)
     return replace(item, parameters=found)

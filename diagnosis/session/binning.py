@@ -1,4 +1,4 @@
-"""Large panels: sessions are diagnosed with coarser pixels, and the answer is put in terms of the panel's own.
+"""Large panels: sessions are diagnosed with binned pixels, and the answer is put in terms of the panel's own.
 
 Every probe and every response is a picture of the panel; at 760 x 956 they would fill the memory of a large machine and
 take hours, for effects of which most are as plain in a fortieth of the pixels.
@@ -14,7 +14,7 @@ LEAST_SIDE = 16  # rows and columns below which pictures say nothing
 LARGEST_PIXELS = 2**15  # of a frame that is diagnosed as it is
 
 
-def coarse_factor(shape: tuple[int, int]) -> int:
+def bin_factor(shape: tuple[int, int]) -> int:
     """Pixels along each side of the squares to average, so that a frame has no more than LARGEST_PIXELS.
 
     Fewer where a long strip would be left with less than LEAST_SIDE rows or columns.
@@ -25,17 +25,17 @@ def coarse_factor(shape: tuple[int, int]) -> int:
     return max(1, min(factor, min(shape) // LEAST_SIDE))
 
 
-def unseen_in_squares() -> dict[str, str]:
+def lost_by_binning() -> dict[str, str]:
     """Why effects cannot be seen in squares of pixels, by id."""
-    return {effect.id: effect.lost_in_squares for effect in EFFECTS.values() if effect.lost_in_squares}
+    return {effect.id: effect.lost_by_binning for effect in EFFECTS.values() if effect.lost_by_binning}
 
 
-def in_squares(parameter: Parameter, factor: int) -> Parameter:
+def per_bin(parameter: Parameter, factor: int) -> Parameter:
     """A parameter with its range as it is where squares stand for pixels."""
-    share = parameter.pixels_per_square(factor)
+    share = parameter.pixels_per_bin(factor)
     return replace(parameter, low=parameter.low / share, high=parameter.high / share, default=parameter.default / share)
 
 
 def parameters_in_pixels(effect: str, parameters: Mapping[str, float], factor: int) -> dict[str, float]:
     """Parameters of an effect, strength with them, that were found with squares of pixels."""
-    return {name: value * EFFECTS[effect].pixels_per_square(name, factor) for name, value in parameters.items()}
+    return {name: value * EFFECTS[effect].pixels_per_bin(name, factor) for name, value in parameters.items()}

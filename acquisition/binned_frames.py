@@ -1,4 +1,4 @@
-"""An acquisition with coarser pixels: frames and thickness maps are means of squares of pixels.
+"""An acquisition with binned pixels: frames and thickness maps are means of squares of pixels.
 
 What is averaged afterwards has the level of one pixel and less noise than one; the whole numbers of the ADC are lost.
 """
@@ -16,7 +16,7 @@ from .acquisition_io import AcquisitionFile, Scene, Series
 from .log_images import logarithm_of_share, transmitted_share
 
 
-def coarser(acquisition: AcquisitionFile, factor: int) -> AcquisitionFile:
+def binned(acquisition: AcquisitionFile, factor: int) -> AcquisitionFile:
     """The acquisition with means of factor x factor pixels in place of pixels; it reads from the given one, which stays open.
 
     Rows and columns that fill no square are left out, evenly on both sides. A series is averaged when it is first read and
@@ -32,7 +32,7 @@ def coarser(acquisition: AcquisitionFile, factor: int) -> AcquisitionFile:
     shapes = [item.shape for item in acquisition.series]
     if factor < 1 or any(min(shape) < factor for shape in shapes):
         raise InputError(
-            "factor of coarser pixels",
+            "factor of binned pixels",
             received=factor,
             expected=f"from 1 to {min((min(shape) for shape in shapes), default=1)}, the shorter side of the frames",
         )
@@ -46,11 +46,11 @@ def coarser(acquisition: AcquisitionFile, factor: int) -> AcquisitionFile:
             replace(item, _frames=_MeanFrames(item, factor), shape=_smaller(item.shape, factor))
             for item in acquisition.series
         ),
-        scenes={name: _coarser_scene(scene, factor) for name, scene in acquisition.scenes.items()},
+        scenes={name: _binned_scene(scene, factor) for name, scene in acquisition.scenes.items()},
     )
 
 
-def means_of_squares(images: NDArray[Any], factor: int) -> NDArray[np.float32]:
+def means_of_bins(images: NDArray[Any], factor: int) -> NDArray[np.float32]:
     """Means over factor x factor pixels of images (..., row, column)."""
     rows, columns = _smaller((images.shape[-2], images.shape[-1]), factor)
     top, left = (images.shape[-2] - rows * factor) // 2, (images.shape[-1] - columns * factor) // 2
@@ -68,7 +68,7 @@ def _smaller(shape: tuple[int, int], factor: int) -> tuple[int, int]:
 
 
 class _MeanFrames:
-    """Frames (frame, row, column) of coarser pixels, averaged when first asked for; read as a dataset is."""
+    """Frames (frame, row, column) of binned pixels, averaged when first asked for; read as a dataset is."""
 
     def __init__(self, series: Series, factor: int) -> None:
         self.dtype = np.dtype(np.float32)
@@ -93,11 +93,11 @@ class _MeanFrames:
     def _means(self, frames: NDArray[Any]) -> NDArray[np.float32]:
         if "log" in self._series.corrected:
             # light adds up, not its logarithm
-            return logarithm_of_share(means_of_squares(transmitted_share(frames), self._factor))
-        return means_of_squares(frames, self._factor)
+            return logarithm_of_share(means_of_bins(transmitted_share(frames), self._factor))
+        return means_of_bins(frames, self._factor)
 
 
-def _coarser_scene(scene: Scene, factor: int) -> Scene:
+def _binned_scene(scene: Scene, factor: int) -> Scene:
     return replace(
         scene,
         shape=None if scene.shape is None else _smaller(scene.shape, factor),
@@ -109,7 +109,7 @@ def _coarser_scene(scene: Scene, factor: int) -> Scene:
 
 def _mask(mask: NDArray[np.bool_] | None, factor: int) -> NDArray[np.bool_] | None:
     """A square belongs to what covers half of it."""
-    return None if mask is None else means_of_squares(mask, factor) >= 0.5
+    return None if mask is None else means_of_bins(mask, factor) >= 0.5
 
 
 class _MeanMaps(Mapping[str, NDArray[np.float32]]):
@@ -120,7 +120,7 @@ class _MeanMaps(Mapping[str, NDArray[np.float32]]):
         self._factor = factor
 
     def __getitem__(self, material: str) -> NDArray[np.float32]:
-        return means_of_squares(self._maps[material], self._factor)
+        return means_of_bins(self._maps[material], self._factor)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._maps)

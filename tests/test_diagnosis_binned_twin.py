@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from raytwin.acquisition import open_acquisition
-from raytwin.acquisition.coarser import coarser, means_of_squares
+from raytwin.acquisition.binned_frames import binned, means_of_bins
 from raytwin.calibration.calibrate import calibrate_twin
 from raytwin.cli import main
-from raytwin.diagnosis.session import coarse
-from raytwin.diagnosis.session.coarse_twin import twin_in_squares
+from raytwin.diagnosis.session import binning
+from raytwin.diagnosis.session.binned_twin import binned_twin
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.frames.line_model import LineModel
 from raytwin.generator.line.series_request import SeriesRequest
@@ -36,8 +36,8 @@ def both(request, session):
     factor = request.param
     with open_acquisition(session) as acquisition:
         fine = calibrate_twin(acquisition, rng=np.random.default_rng(1))
-        averaged = calibrate_twin(coarser(acquisition, factor), rng=np.random.default_rng(1))
-    return factor, twin_in_squares(fine, factor), averaged
+        averaged = calibrate_twin(binned(acquisition, factor), rng=np.random.default_rng(1))
+    return factor, binned_twin(fine, factor), averaged
 
 
 def test_maps_and_levels_are_those_of_averaged_frames(both):
@@ -77,7 +77,7 @@ def test_spectra_give_squares_the_level_of_pixels_and_fewer_dn_a_photon(both, se
     request = SeriesRequest(kind="flat", frames=4, exposure_ms=flat.exposure_ms, setting=replace(flat.setting, kV=64.0))
     whole, small = LineModel(fine).expect(request), LineModel(squares).expect(request)
     good = squares.maps.bad_pixels == 0
-    there = means_of_squares(np.asarray(whole.signal_DN), factor)
+    there = means_of_bins(np.asarray(whole.signal_DN), factor)
     # bad pixels apart, which are no light's doing
     np.testing.assert_allclose(np.median(np.asarray(small.signal_DN)[good]), np.median(there[good]), rtol=1e-3)
     gains = [squares.spectral.best, fine.spectral.best]
@@ -94,7 +94,7 @@ def test_lengths_of_its_effects_are_in_squares(series_line):
         AppliedEffect(id="object_scatter", parameters={"strength": 9.0}, since="calibration"),
         AppliedEffect(id="somebody_else_s", parameters={"strength": 1.0}),
     )
-    small = twin_in_squares(replace(series_line, effects=had), 2).effects
+    small = binned_twin(replace(series_line, effects=had), 2).effects
     assert [item.id for item in small] == [item.id for item in had]
     assert small[0].parameters["strength"] == 2.0
     assert small[1].parameters["reach_px"] == 1.5
@@ -105,7 +105,7 @@ def test_lengths_of_its_effects_are_in_squares(series_line):
 
 def test_a_panel_without_pitch_keeps_its_level(series_line):
     bare = replace(series_line, instrument=replace(series_line.instrument, pixel_mm=None))
-    small = twin_in_squares(bare, 2)
+    small = binned_twin(bare, 2)
     names = small.spectral.names
     moved = dict(zip(names, small.spectral.best - bare.spectral.best, strict=True))
     assert moved["log_DN_per_keV"] + moved["log_output"] == pytest.approx(0.0)
@@ -115,10 +115,10 @@ def test_a_panel_without_pitch_keeps_its_level(series_line):
 def test_a_square_with_a_bad_pixel_is_bad(series_line):
     bad = np.zeros((40, 40), np.uint8)
     bad[5, 9], bad[5, 8] = 3, 1
-    small = twin_in_squares(replace(series_line, maps=replace(series_line.maps, bad_pixels=bad)), 2)
+    small = binned_twin(replace(series_line, maps=replace(series_line.maps, bad_pixels=bad)), 2)
     assert small.maps.bad_pixels[2, 4] == 3
     assert np.count_nonzero(small.maps.bad_pixels) == 1
-    assert twin_in_squares(series_line, 1) is series_line
+    assert binned_twin(series_line, 1) is series_line
 
 
 @pytest.mark.slow
@@ -126,7 +126,7 @@ def test_another_day_of_a_large_panel_is_compared_in_squares_with_its_own_twin(t
     words = ["--protocol", "short", "--seed", "33", "--size", "96", "--frames", "12", "--products", "2"]
     assert main(["lab", "--family", "none", "-o", str(tmp_path / "first.h5"), *words]) == 0
     assert main(["diagnose", str(tmp_path / "first.h5"), "-o", str(tmp_path / "first"), "--json"]) == 0
-    monkeypatch.setattr(coarse, "LARGEST_PIXELS", 48 * 48)
+    monkeypatch.setattr(binning, "LARGEST_PIXELS", 48 * 48)
     later, answer, twin = tmp_path / "later.h5", tmp_path / "later", tmp_path / "first" / "twin.h5"
     moving = ["--session", "1", "--effect", "motion_blur=6@always"]
     assert main(["lab", "--family", "none", "-o", str(later), *words, *moving]) == 0

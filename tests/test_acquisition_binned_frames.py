@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from raytwin.acquisition import open_acquisition
 from raytwin.acquisition.acquisition_io import write_acquisition
-from raytwin.acquisition.coarser import coarser, means_of_squares
+from raytwin.acquisition.binned_frames import binned, means_of_bins
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.errors import InputError
@@ -32,7 +32,7 @@ def session(tmp_path):
 @given(rows=st.integers(1, 40), columns=st.integers(1, 40), factor=st.integers(1, 8), seed=st.integers(0, 1000))
 def test_means_over_squares_keep_the_mean_of_the_part_they_cover(rows, columns, factor, seed):
     image = np.random.default_rng(seed).uniform(0, 100, size=(2, rows, columns))
-    small = means_of_squares(image, factor)
+    small = means_of_bins(image, factor)
     assert small.shape == (2, rows // factor, columns // factor)
     top, left = (rows % factor) // 2, (columns % factor) // 2
     part = image[:, top : top + rows // factor * factor, left : left + columns // factor * factor]
@@ -44,7 +44,7 @@ def test_means_over_squares_keep_the_mean_of_the_part_they_cover(rows, columns, 
 def test_frames_maps_and_pitch_are_those_of_larger_pixels(session):
     path, frames, thickness_mm = session
     with open_acquisition(path) as acquisition:
-        small = coarser(acquisition, 3)
+        small = binned(acquisition, 3)
         assert small.instrument.pixel_mm == pytest.approx(0.45)
         assert [item.shape for item in small.series] == [(7, 10), (7, 10)]
         expected = frames[:, 1:22, :30].reshape(7, 7, 3, 10, 3).mean(axis=(2, 4))
@@ -65,10 +65,10 @@ def test_frames_maps_and_pitch_are_those_of_larger_pixels(session):
 
 def test_a_factor_that_leaves_no_pixel_is_refused(session):
     with open_acquisition(session[0]) as acquisition:
-        assert coarser(acquisition, 1) is acquisition
+        assert binned(acquisition, 1) is acquisition
         for factor in (0, 24):
             with pytest.raises(InputError, match="from 1 to 23"):
-                coarser(acquisition, factor)
+                binned(acquisition, factor)
 
 
 def test_light_of_log_images_is_averaged_not_its_logarithm(session, tmp_path):
@@ -84,6 +84,6 @@ def test_light_of_log_images_is_averaged_not_its_logarithm(session, tmp_path):
             corrected=("offset", "gain", "log"),
         )
     with open_acquisition(tmp_path / "logs.h5") as acquisition:
-        small = coarser(acquisition, 3).series[0].read_frames()
+        small = binned(acquisition, 3).series[0].read_frames()
     expected = share[:, 1:22, :30].reshape(2, 7, 3, 10, 3).mean(axis=(2, 4))
     np.testing.assert_allclose(np.exp(-small), expected, rtol=1e-5)

@@ -29,6 +29,7 @@ from ..generator.predictions.predict import Prediction, predict_flatfield, satur
 from .sweep_file import Campaign, Limits, Pair, Requirement, Timing, text_of_pair
 
 if TYPE_CHECKING:
+    from ..generator.datasets.render import Geometry
     from ..generator.predictions.contrast import SlabContrasts
     from ..generator.scenes.describe import Description
 
@@ -87,7 +88,10 @@ class Scout:
         self.twin = replace(twin, instrument=limited_instrument(twin.instrument, campaign.limits))
         self._datasets: list[Dataset] = []
         self._descriptions: list[Description] = []
-        self._contrasts: SlabContrasts | None = None  # beams that several settings share are computed once
+        self._contrasts: SlabContrasts | None = None
+        # settings of one tube voltage stand in many pairs: what each says by itself is kept
+        self._predictions: dict[Setting, Prediction] = {}
+        self._channels: dict[tuple[int, Setting, float | None, Geometry], tuple[str, ...]] = {}
         for word, path in (("references", campaign.references), ("test_references", campaign.test_references)):
             if path is None:
                 continue
@@ -109,7 +113,7 @@ class Scout:
         known: dict[str, Any] = {"belt_speed_mm_s": pair[0].belt_speed_mm_s}
         warnings: list[str] = []
         try:
-            predictions = tuple(predict_flatfield(self.twin, one) for one in pair)
+            predictions = tuple(map(self._predicted, pair))
             for found in predictions:
                 warnings += found.warnings
             known |= _costs(self.twin, pair, predictions, self.campaign.timing)
@@ -125,15 +129,25 @@ class Scout:
         missed = _missed(self.campaign.requirement, known)
         return Outlook(pair=pair, kept=not missed, why_left_out=missed, warnings=_once(warnings), **known)
 
+    def _predicted(self, setting: Setting) -> Prediction:
+        if setting not in self._predictions:
+            self._predictions[setting] = predict_flatfield(self.twin, setting)
+        return self._predictions[setting]
+
     def _try_images(self, pair: Pair) -> tuple[str, ...]:
         """Whether images can be made at all; the noise of one reference of each kind is weighed."""
         from ..generator.datasets.generate import ReferenceImages
-        from ..generator.datasets.generate_described import DescribedScenes
+        from ..generator.datasets.generate_described import channel_warnings, described_geometry
 
         twin, told = twin_at(self.twin, pair)
         found: list[str] = list(told)
-        for description in self._descriptions:
-            found += DescribedScenes(twin, description, low=pair[0], high=pair[1], seed=0).warnings
+        for number, description in enumerate(self._descriptions):
+            geometry = described_geometry(twin, description, low=pair[0], high=pair[1])
+            for setting in pair:
+                key = (number, setting, pair[0].belt_speed_mm_s, geometry)
+                if key not in self._channels:
+                    self._channels[key] = channel_warnings(twin, description, setting, geometry)
+                found += self._channels[key]
         for dataset in self._datasets:
             _check_distance(self.twin.instrument, pair, dataset, self.campaign.reference_setting)
             images = ReferenceImages(

@@ -418,6 +418,20 @@ def test_what_cannot_be_is_a_row_with_its_reason(line, words, reason):
     assert not found[0].feasible and not found[0].kept and "\n" not in found[0].reason
 
 
+def test_what_is_known_of_a_setting_is_the_same_whichever_were_looked_at_before(line):
+    text = CAMPAIGN.replace('references = "references.h5"', 'references = "products.toml"')
+    text = text.replace("low_kv = 40", "low_kv = [40, 45]").replace(
+        "high_kv = 90", "high_kv = [80, 90]\nbelt_speed_mm_s = [30, 90]"
+    )
+    text = text.replace("start_steps = 2", "start_steps = 0")
+    campaign = campaign_of(line, name="described.toml", text=text)
+    together = look_ahead(campaign)
+    assert len({one.pair[0] for one in together}) < len(together)
+    assert together == tuple(
+        look_ahead(dataclasses.replace(campaign, settings=(pair,)))[0] for pair in campaign.settings
+    )
+
+
 def test_dose_time_and_throughput_are_those_of_both_images(line):
     campaign = read_campaign(line / "campaign.toml")
     twin = read_twin(line / "twin.h5")

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from ...acquisition.dataset_io import DatasetRow, write_dataset
 from ...acquisition.setting import Setting
 from ...errors import InputError
 from ...files import sha256_of_file
-from ..frames.present_line import present_line
+from ..frames.present_line import PresentLine, present_line
 from ..line.binning import refuse_binning
 from ..line.twin import BAD_PIXEL_MAP, Twin
 from ..references.transfer import Channel
@@ -48,6 +48,49 @@ class DescribedPair:
     row: DatasetRow
 
 
+def described_geometry(
+    twin: Twin, description: Description, *, low: Setting, high: Setting, bad_pixels: str = "repaired"
+) -> Geometry:
+    """The geometry in which a line sees a description's scenes at two settings.
+
+    Raises:
+        InputError: a twin without spectral part or geometry, settings that are no pair.
+    """
+    refuse_binning(low, high)
+    refuse_without_spectrum(twin)
+    refuse_pair(low, high, bad_pixels=bad_pixels)
+    return geometry_of(twin, settings=(low, high), line=description.line)
+
+
+def channel_warnings(twin: Twin, description: Description, setting: Setting, geometry: Geometry) -> tuple[str, ...]:
+    """What is said of a description's images at one setting, whatever the other one is.
+
+    Raises:
+        InputError: a setting that the twin cannot reach.
+    """
+    line = present_line(twin)
+    model = _channel_model(line, description, setting, geometry, bad_pixels="repaired")
+    return (*line.warnings, *_warnings_of((model,)))
+
+
+def _channel_model(
+    line: PresentLine, description: Description, setting: Setting, geometry: Geometry, *, bad_pixels: str
+) -> ChannelModel:
+    """One setting of a line in a geometry."""
+    instrument = replace(
+        line.twin.instrument,
+        pixel_mm=geometry.pixel_mm,
+        source_object_mm=geometry.source_object_mm,
+        source_detector_mm=geometry.source_detector_mm,
+    )
+    material = description.products[0].material or "water"
+    return ChannelModel(line.twin, setting, material, bad_pixels, line.effects, instrument)
+
+
+def _warnings_of(models: Sequence[ChannelModel]) -> tuple[str, ...]:
+    return (*(text for model in models for text in model.warnings), *effect_warnings(models, references=False))
+
+
 class DescribedScenes:
     """Draws the scenes of a description as one line sees them; scene `number` is the same however often it is asked for.
 
@@ -66,9 +109,7 @@ class DescribedScenes:
         bad_pixels: str = "repaired",
         supersampling: int = SUPERSAMPLING,
     ) -> None:
-        refuse_binning(low, high)
-        refuse_without_spectrum(twin)
-        refuse_pair(low, high, bad_pixels=bad_pixels)
+        self.geometry: Geometry = described_geometry(twin, description, low=low, high=high, bad_pixels=bad_pixels)
         if not 1 <= supersampling <= 9:
             raise InputError("supersampling", received=supersampling, expected="1 to 9 sub-pixels along each axis")
         line = present_line(twin)
@@ -78,22 +119,10 @@ class DescribedScenes:
         self.settings = (low, high)
         self.seed = seed
         self.supersampling = supersampling
-        self.geometry: Geometry = geometry_of(twin, settings=(low, high), line=description.line)
-        material = description.products[0].material or "water"
-        instrument = replace(
-            twin.instrument,
-            pixel_mm=self.geometry.pixel_mm,
-            source_object_mm=self.geometry.source_object_mm,
-            source_detector_mm=self.geometry.source_detector_mm,
-        )
         self.models = tuple(
-            ChannelModel(twin, one, material, bad_pixels, line.effects, instrument) for one in (low, high)
+            _channel_model(line, description, one, self.geometry, bad_pixels=bad_pixels) for one in (low, high)
         )
-        self.warnings = (
-            *line.warnings,
-            *(text for model in self.models for text in model.warnings),
-            *effect_warnings(self.models, references=False),
-        )
+        self.warnings = (*line.warnings, *_warnings_of(self.models))
         self._channels: tuple[Channel, ...] = tuple(model.channel() for model in self.models)
         self._detector = detector_noise(twin, bad_pixels=bad_pixels)
         self._products: dict[int, Individual] = {}

@@ -8,8 +8,8 @@ are met by the model itself and not by its derivatives.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -75,6 +75,8 @@ _MOST_POWERS = 100
 _FORGOTTEN = 0.3  # correlation with where they were: from there on walkers are draws of their own
 _ENOUGH = 600.0  # effective draws; the linear parameters are drawn anew for each of those kept
 _BELOW_END = 0.85  # of kV in keV: up to here a measured spectrum corrects the model
+_SAYS_NOTHING = 30.0  # sd of the logarithm of a datum that is left out
+_MOST_ROUNDS = 6  # of fits to data that contradict the model, their errors larger each time
 _WIDEST_SIZE = 4.0  # prior standard deviations of the logarithm of a discrepancy's size
 _STUDENT_DEGREES = 5.0
 _MIXTURE = (0.75, 0.2, 0.05)
@@ -97,7 +99,7 @@ OTHER_SCINTILLATOR = (Filter(material="Gd2O2S@7.32", thickness_mm=0.15),)
 class SpectralFit:
     """Posterior and how well it was drawn: effective sample size of the last round, chi-square at the best point.
 
-    Draws of a posterior that contradicts its data are spread out, see `_spread_out`.
+    Where data contradict the model, draws are as `_with_data_in_error` says, and chi-square is of the data as they are.
 
     discrepancy: median and 95 % interval of the learned relative sd of a level and of a gain beyond the parameters. output: the
     tube's over the model's, where it is so far from 1 that labels must be wrong and nothing else was learnt from it; None elsewhere.
@@ -117,7 +119,12 @@ def contradicts(fit: SpectralFit) -> bool:
 
 
 def _too_far(chi_square: float, data: int) -> bool:
-    return chi_square > data + 4 * math.sqrt(2 * data)
+    return chi_square > _farthest(data)
+
+
+def _farthest(data: int) -> float:
+    """Largest plausible chi-square of so many data."""
+    return data + 4 * math.sqrt(2 * data)
 
 
 def unlike_output(fit: SpectralFit) -> list[str]:
@@ -161,6 +168,7 @@ class _Datum:
     over: int  # beam of the denominator of a ratio
     value: float  # logarithm
     sd: float
+    of: tuple[str, int]  # measurement: a level gives its rate and its gain
     calibration: float = 0.0  # of a kerma: the uncertainty of its dosimeter's calibration over the table's mean
 
 
@@ -384,16 +392,17 @@ def fit_spectrum(
     data = [*_data(known, transmissions, instrument, noise, beams), *_dose_data(kermas, ratios, beams)]
     fixed = {"level": level_discrepancy, "gain": gain_discrepancy}
 
-    def sampled(with_priors: dict[str, Prior]) -> tuple[_Posterior, _Sampled]:
-        posterior = _Posterior(model, with_priors, tuple(beams), data, fixed, _repeated_levels(repeats))
-        return posterior, posterior.sample(rng)
+    def posterior_of(with_priors: dict[str, Prior], data: Sequence[_Datum]) -> _Posterior:
+        return _Posterior(model, with_priors, tuple(beams), data, fixed, _repeated_levels(repeats))
 
-    posterior, (best, samples, discrepancies, effective) = sampled(priors)
+    posterior = posterior_of(priors, data)
+    best, samples, discrepancies, effective = posterior.sample(rng)
     output = None
     place, believed = model.names.index(_OUTPUT), priors[_OUTPUT]
     if believed is PRIORS[_OUTPUT] and abs(best[place]) > _OUTPUT_LOOKED_AT * believed.sd:
         # believed, a slip of units would be made up for by the spectrum
-        other, found = sampled(priors | {_OUTPUT: UNLIKE_OUTPUT})
+        other = posterior_of(priors | {_OUTPUT: UNLIKE_OUTPUT}, data)
+        found = other.sample(rng)
         logarithm = found[1][:, place]
         away = abs(float(np.mean(logarithm))) / math.hypot(float(np.std(logarithm)), believed.sd)
         # a slip of the output alone leaves data that agree
@@ -402,7 +411,10 @@ def fit_spectrum(
             output, priors = math.exp(float(np.median(logarithm))), priors | {_OUTPUT: UNLIKE_OUTPUT}
     chi_square = posterior.chi_square(best)
     if _too_far(chi_square, len(data)):
-        samples = _spread_out(samples, math.sqrt(chi_square / len(data)), [priors[name] for name in model.names])
+        # what single levels stray by is known from the data as they are
+        best, samples, effective = _with_data_in_error(
+            lambda changed: posterior_of(priors, changed), posterior, best, rng
+        )
     names = model.names
     voltages = [level.kV or 0.0 for level in known] or [kV for kV, _ in read]
     measured = [level.filters for level in known] or [filters for _, filters in read]
@@ -440,17 +452,48 @@ def fit_spectrum(
     )
 
 
-def _spread_out(samples: NDArray[np.float64], ratio: float, priors: Sequence[Prior]) -> NDArray[np.float64]:
-    """Draws (draw, parameter) spread about their means by a Birge ratio, no parameter wider than its prior or beyond its bounds.
+def _with_data_in_error(
+    posterior_of: "Callable[[Sequence[_Datum]], _Posterior]",
+    contradicting: "_Posterior",
+    best: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Best set, draws (draw, parameter) and effective draws where data contradict the model.
 
-    Data that contradict a model are taken to err by so much more than they state, all alike.
+    Where data and priors agree without one measurement, that one may be wrong: draws are of the fits without each such one, in
+    equal shares, for nothing says which it is. Where it takes more than one, or there are only two, all data err by the Birge
+    ratio more.
 
-    Source: Birge (1932), doi:10.1103/PhysRev.40.207; ratio: sqrt(chi-square / number of data).
+    Args:
+        posterior_of: the posterior of changed data.
+        contradicting, best: the posterior of the data as they are, and its best set (parameter,).
     """
-    middle, sd = samples.mean(axis=0), samples.std(axis=0)
-    most = np.array([prior.spread for prior in priors]) / np.maximum(sd, 1e-300)
-    wider = middle + (samples - middle) * np.clip(most, 1.0, ratio)
-    return np.asarray(np.clip(wider, [prior.low for prior in priors], [prior.high for prior in priors]))
+    measurements = sorted({item.of for item in contradicting.data})
+    fits = []
+    for one in measurements if len(measurements) > 2 else ():
+        data = [replace(item, sd=_SAYS_NOTHING) if item.of == one else item for item in contradicting.data]
+        farthest = _farthest(sum(item.of != one for item in data))
+        posterior = posterior_of(data)
+        try:
+            found, samples, _, effective = posterior.sample(rng, farthest=farthest)
+        except FitError:
+            continue
+        if (squares := posterior.squares_with_priors(found)) <= farthest:
+            fits.append((squares, found, samples, effective))
+    if fits:
+        share = -(-len(fits[0][2]) // len(fits))
+        return (
+            min(fits, key=lambda fit: fit[0])[1],
+            np.concatenate([samples[:share] for _, _, samples, _ in fits]),
+            sum(effective for *_, effective in fits) / len(fits),
+        )
+    in_error = contradicting
+    for _ in range(_MOST_ROUNDS):
+        in_error = posterior_of(in_error.data_in_error(in_error.birge_ratio(best)))
+        best, samples, _, effective = in_error.sample(rng)
+        if in_error.birge_ratio(best) <= 1.0:
+            break
+    return best, samples, effective
 
 
 def _shares(levels: Sequence[Level], noise: NoiseModel | None) -> list[float]:
@@ -481,16 +524,16 @@ def _data(
     sloped = [level for level in levels if level.photon_transfer_slope_DN.value > 0 and level.gain_DN.value > 0]
     share = dict(zip(map(id, levels), _shares(levels, noise), strict=True)) if sloped else {}
     data = []
-    for level in levels:
+    for place, level in enumerate(levels):
         beam = number(level.kV or 0.0, level.filters)
         rate = level.rate_DN_per_mAs
         if rate is not None and rate.value > 0:
             factor = geometry_factor(source_detector_mm=level.source_detector_mm, pixel_mm=instrument.pixel_mm)
-            data.append(_Datum("rate", beam, -1, math.log(rate.value / factor), _relative_sd(rate)))
+            data.append(_Datum("rate", beam, -1, math.log(rate.value / factor), _relative_sd(rate), ("level", place)))
         gain = level.photon_transfer_slope_DN if share else level.gain_DN
         value = gain.value / share.get(id(level), 1.0)
-        data.append(_Datum("gain", beam, -1, math.log(max(value, 1e-12)), _relative_sd(gain)))
-    for item in transmissions:
+        data.append(_Datum("gain", beam, -1, math.log(max(value, 1e-12)), _relative_sd(gain), ("level", place)))
+    for place, item in enumerate(transmissions):
         data.append(
             _Datum(
                 "transmission",
@@ -498,6 +541,7 @@ def _data(
                 number(item.kV, item.filters),
                 math.log(item.value),
                 item.relative_sd,
+                ("transmission", place),
             )
         )
     return data
@@ -510,13 +554,14 @@ def _dose_data(
         return beams.setdefault(OpenBeam(kV=kV, filters=filters, absorber=absorber), len(beams))
 
     data = []
-    for item in kermas:
-        value = math.log(item.value)
-        data.append(_Datum("kerma", number(item.kV, item.filters), -1, value, item.relative_sd, item.calibration_sd))
-    for ratio in ratios:
+    for place, item in enumerate(kermas):
+        beam, value = number(item.kV, item.filters), math.log(item.value)
+        data.append(_Datum("kerma", beam, -1, value, item.relative_sd, ("kerma", place), item.calibration_sd))
+    for place, ratio in enumerate(ratios):
         behind = number(ratio.kV, (*ratio.filters, *ratio.layers), ratio.absorber)
         kind = "signal_ratio" if ratio.of_signal else "kerma_ratio"
-        data.append(_Datum(kind, behind, number(ratio.kV, ratio.filters), math.log(ratio.value), ratio.relative_sd))
+        bare, value = number(ratio.kV, ratio.filters), math.log(ratio.value)
+        data.append(_Datum(kind, behind, bare, value, ratio.relative_sd, ("ratio", place)))
     return data
 
 
@@ -686,11 +731,33 @@ class _Posterior:
                     # the derivatives may stand where the data put this parameter
                     value[:, column] += parameters[:, self.model.names.index(name)] * by
 
+    @property
+    def _largest_variances(self) -> NDArray[np.float64]:
+        """Variance of each datum's logarithm (datum,) with the largest plausible discrepancy."""
+        return np.asarray(self.variances(np.full((1, self.dimensions), _Z95))[0])
+
     def chi_square(self, parameters: NDArray[np.float64]) -> float:
         """Squared misfit over noise and the largest plausible discrepancy, at one parameter set (parameter,)."""
-        variance = self.variances(np.full((1, self.dimensions), _Z95))[0]
         misfit = self.value - self.expectation(parameters[None, :])[0][0]
-        return float(np.sum(misfit**2 / variance))
+        return float((misfit**2 / self._largest_variances).sum())
+
+    def squares_with_priors(self, parameters: NDArray[np.float64]) -> float:
+        """`chi_square` and how far parameters (parameter,) lie from their priors: at the best, as many as there are data."""
+        latent = (ALTERNATIVE_SCINTILLATOR, *(("kV_variance",) if self.rippling else ()))
+        known = np.array([name not in latent for name in self.model.names])
+        return self.chi_square(parameters) + float(np.sum(((parameters - self.centre) / self.sd)[known] ** 2))
+
+    def birge_ratio(self, parameters: NDArray[np.float64]) -> float:
+        """By how much data err more than they state, all alike, at the best parameter set (parameter,).
+
+        Source: Birge (1932), doi:10.1103/PhysRev.40.207; ratio: sqrt(chi-square / number of data).
+        """
+        return math.sqrt(self.squares_with_priors(parameters) / len(self.data))
+
+    def data_in_error(self, ratio: float) -> list[_Datum]:
+        """Data that err so many times more than they state, departures from the model included."""
+        sd = ratio * np.sqrt(self._largest_variances)
+        return [replace(item, sd=float(own)) for item, own in zip(self.data, sd, strict=True)]
 
     def _conditional(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Log likelihood (draw,) and mean (draw, linear) of the linear parameters given u, in units of their prior sd."""
@@ -794,14 +861,21 @@ class _Posterior:
         full[:, output] += beyond
         return full
 
+    def _best_from(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The most probable set (parameter,) near a draw (dimension,)."""
+        return np.asarray(self.with_linear(self._climb(u)[None, :], None)[0])
+
     def sample(
-        self, rng: np.random.Generator
+        self, rng: np.random.Generator, *, farthest: float = math.inf
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], dict[str, NDArray[np.float64]], float]:
         """Best set (parameter,), equally likely draws (draw, parameter), their discrepancies, effective sample size.
 
         Importance sampling from the prior to the posterior by way of flattened posteriors (likelihood to the power of
         a rising temper), each proposed from the one before; where its own covariance does not describe the posterior,
         by walkers (`_walked`).
+
+        Raises:
+            FitError: no draws were found, or none as near to data and priors (`squares_with_priors`) as `farthest`.
         """
         u = rng.standard_normal((2 * _ROUND_DRAWS, self.dimensions))
         log_ratio = np.zeros(len(u))  # prior over proposal
@@ -826,6 +900,12 @@ class _Posterior:
         else:
             weight, effective = _weights(likelihood + log_ratio)
         if effective < _LEAST_EFFECTIVE:
+            # walking takes long
+            nearest = u[
+                int(np.argmax(np.where(np.isfinite(likelihood), likelihood - 0.5 * np.sum(u**2, axis=1), -np.inf)))
+            ]
+            if self.squares_with_priors(self._best_from(nearest)) > farthest:
+                raise FitError("the levels contradict each other or the declared instrument")
             u, likelihood, effective = self._walked(u, likelihood, log_ratio, rng)
             weight = np.full(len(u), 1.0 / len(u))
         if effective < _LEAST_EFFECTIVE:
@@ -836,10 +916,9 @@ class _Posterior:
         chosen = _resampled(weight, _KEPT, rng)
         with np.errstate(invalid="ignore"):
             density = likelihood - 0.5 * np.sum(u**2, axis=1)
-        best = self._climb(u[int(np.argmax(density))])
         kept = u[chosen]
         return (
-            self.with_linear(best[None, :], None)[0],
+            self._best_from(u[int(np.argmax(density))]),
             self.with_linear(kept, rng),
             self.discrepancies(kept),
             effective,

@@ -10,14 +10,13 @@ from scipy.stats import binom
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter, filters_from_text
 from raytwin.calibration import spectral_fit
-from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY, Prior, draw_parameters
+from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY, draw_parameters
 from raytwin.calibration.spectral_fit import (
     OTHER_SCINTILLATOR,
     SHAPE_PARAMETERS,
     Transmission,
     _Posterior,
     _repeated_levels,
-    _spread_out,
     correction_from_spectra,
     fit_spectrum,
     geometry_factor,
@@ -214,21 +213,23 @@ def test_labels_of_another_unit_are_named_and_bend_no_filtration(model, factor):
     assert filtration.value == pytest.approx(right.posterior.interval("inherent_filtration_mm_Al").value, abs=0.4)
 
 
-def test_draws_that_contradict_their_data_spread_to_no_more_than_the_prior():
-    rng = np.random.default_rng(2)
-    samples = np.array([2.0, 0.1, 5.0]) + np.array([0.1, 0.02, 0.1]) * rng.standard_normal((4000, 3))
-    priors = [
-        Prior(centre=2.0, sd=1.5, low=0.0, high=12.0, reason=""),
-        Prior(centre=0.0, sd=0.05, low=0.0, reason=""),
-        Prior(centre=0.0, sd=20.0, reason=""),
-    ]
-    found = _spread_out(samples, 4.0, priors)
-    assert found.std(axis=0)[[0, 2]] == pytest.approx(4.0 * samples.std(axis=0)[[0, 2]])
-    assert found.mean(axis=0) == pytest.approx(samples.mean(axis=0), rel=0.01)
-    assert 1.3 * samples[:, 1].std() < found[:, 1].std() < 1.05 * priors[1].spread
-    far = _spread_out(samples, 1000.0, priors)
-    assert far[:, 0].min() == 0.0 and far[:, 0].std() < 1.05 * priors[0].spread
-    assert far[:, 2].std() == pytest.approx(20.0)
+@pytest.mark.parametrize("wrong", ["filter", "exchanged"])
+def test_levels_that_contradict_every_spectrum_leave_intervals_that_hold_the_truth(model, wrong):
+    truth = typical(model, inherent_filtration_mm_Al=1.6)
+    soft, bare, hard = levels_of(model, truth, BEAMS)
+    if wrong == "filter":
+        soft = replace(soft, filters=())
+    else:
+        soft, hard = replace(soft, kV=90.0), replace(hard, kV=40.0)
+    fit = fit_spectrum([soft, bare, hard], INSTRUMENT, rng=np.random.default_rng(5))
+    assert spectral_fit.contradicts(fit)
+    filtration = fit.posterior.interval("inherent_filtration_mm_Al")
+    assert filtration.low <= 1.6 <= filtration.high
+    for beam in (*BEAMS, OpenBeam(kV=60.0, filters=())):
+        rates = np.log(model.signal(fit.posterior.samples, beam).rate_DN_per_mAs)
+        exact = float(np.log(model.signal(truth[None, :], beam).rate_DN_per_mAs[0]))
+        low, high = np.quantile(rates, [0.025, 0.975])
+        assert low <= exact <= high
 
 
 def test_more_levels_narrow_the_prediction(model):

@@ -135,7 +135,8 @@ def calibrate_twin(
             if contradicts(fit):
                 warnings.append(
                     f"levels and gains do not fit the spectral model (chi-square {fit.chi_square:.0f} for {fit.data}"
-                    " data), and intervals are widened for it: check kV, filter and power of the series"
+                    " data), and intervals are widened for it: check kV, filter and power of the series (`raytwin check` looks for"
+                    " wrong labels)"
                 )
     else:
         warnings.append("no series states its kV: no spectral part, no prediction at other settings")

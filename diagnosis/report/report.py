@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...checks.findings import FindingCode
 from ...generator.effects import EFFECTS
 from ...reports import Figure, SortedTable, write_page
 from ..judgement.answer import Cause, Diagnosis
@@ -147,6 +148,16 @@ def lead_text(diagnosis: Diagnosis) -> str:
     return f"{seen}. With what was found added to the twin, {ends}.{rest_text(diagnosis)}"
 
 
+_LABELS = (
+    "Check the series named above against the log of the measurement, correct them in the sidecar and import again."
+)
+_REMEDIES = {
+    FindingCode.STOPS: "Find what cuts the numbers off (a lookup table, another bit depth, an export), and measure those series again"
+    " without it.",
+    FindingCode.SHADOW: "Clear the beam and measure those flats again; or declare them as what stood in it.",
+}
+
+
 def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
     """What to do with the answer, most useful first: a sentence each, with a command where there is one."""
 
@@ -161,9 +172,7 @@ def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
     )
     if diagnosis.findings:
         measured = [
-            step(
-                "Check the series named above against the log of the measurement, correct them in the sidecar and import again."
-            ),
+            *(step(text) for text in dict.fromkeys(_REMEDIES.get(item.code, _LABELS) for item in diagnosis.findings)),
             step("Diagnose the session again.", "raytwin diagnose SESSION -o diagnosis"),
             *measured,
         ]

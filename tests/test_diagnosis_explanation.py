@@ -11,6 +11,7 @@ from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis
 from raytwin.diagnosis.judgement.answer import Cause, Diagnosis, Place
 from raytwin.diagnosis.judgement.held_out import Gap
 from raytwin.diagnosis.report.explanation import location_text, paragraph, title_of
+from raytwin.diagnosis.report.report import next_steps
 
 
 def place(axis, series, z, *, statistic="mean frame", location=""):
@@ -148,6 +149,11 @@ def test_a_session_whose_numbers_stop_early_has_a_gap_whatever_the_rest_says():
     found = _with_findings(agreed, (stops,))
     assert (found.verdict, found.unknown_location) == ("unknown_effect", "flat_1, flat_2")
     assert found.no_gap_but_findings
+    steps = next_steps(replace(found, next_measurement={}))
+    assert [step["text"].split(" (")[0] for step in steps] == [
+        "Find what cuts the numbers off",
+        "Diagnose the session again.",
+    ]
     # probabilities are of the series that were compared
     assert (found.hypotheses, found.probability_no_gap) == (agreed.hypotheses, 0.93)
     assert _with_findings(replace(agreed, verdict="explained"), (stops,)).verdict == "explained"

@@ -28,7 +28,7 @@ _LEAST_FRAMES = 6  # half of the lags show what noise is once nothing is shared
 _MOST_FRAMES = 48
 _SIDE_PX = 256  # around the middle: more pixels add nothing to what frames share
 _TILES = 4  # along each side of that, whose scatter is the sampling noise
-_CHANCE = 1e-3  # that frames which share nothing look as if they did
+_BEYOND_CHANCE = 3.3  # standard errors; of frames that share nothing one session in a thousand looks as if they did
 
 FloatArray = NDArray[np.float64]
 
@@ -51,8 +51,6 @@ def frame_memory(
         darks: dark frames.
         good: pixels in use (row, column).
     """
-    from scipy.special import ndtri
-
     found = [
         _differences(item, total, darks.of(item), good)
         for item, total in flats
@@ -65,7 +63,7 @@ def frame_memory(
     if len(tiles) < 2:
         return None
     correlation, error = tiles.mean(axis=0), tiles.std(axis=0, ddof=1) / math.sqrt(len(tiles))
-    if abs(correlation[0]) < -float(ndtri(0.5 * _CHANCE)) * error[0]:
+    if abs(correlation[0]) < _BEYOND_CHANCE * error[0]:
         return None
     # lags at which nothing is seen bring noise alone
     seen = np.abs(correlation) > 2.0 * error
@@ -75,8 +73,18 @@ def frame_memory(
 
 
 def _correlations(differences: FloatArray, lags: int) -> FloatArray:
-    """rho_k of the first lags, of tiles with noise (tile, lag): D_k over that of later lags, each counted with its pairs."""
-    pairs = np.arange(differences.shape[1], 0, -1)
+    """rho_k of the first lags, of tiles with noise (tile, lag): D_k over that of later lags, each counted with its pairs.
+
+    A pattern that comes up steadily adds a square of the lag, which what frames share does not: where later lags show it, it is
+    subtracted.
+    """
+    lag = np.arange(1.0, differences.shape[1] + 1)
+    pairs = lag[::-1]
+    centred = lag[lags:] ** 2 - np.average(lag[lags:] ** 2, weights=pairs[lags:])
+    weight = pairs[lags:] * centred
+    steady = differences[:, lags:] @ weight / (weight @ centred)
+    if len(steady) > 1 and steady.mean() > _BEYOND_CHANCE * steady.std(ddof=1) / math.sqrt(len(steady)):
+        differences = differences - steady[:, None] * lag**2
     late = np.average(differences[:, lags:], axis=1, weights=pairs[lags:])
     noisy = late > 0
     return np.asarray(1.0 - differences[noisy, :lags] / late[noisy, None])

@@ -162,7 +162,6 @@ def test_stack_and_pair_noise_power_agree_on_white_frames():
     assert stack.samples > 1.4 * pairs.samples
 
 
-@pytest.mark.slow
 def test_drift_enters_the_gain_from_stacks_and_not_that_from_pairs(tmp_path):
     """A chessboard that comes up over the series, which no factor of a frame, row or column takes out: +-6 % from first to last."""
     pattern = np.where(np.add.outer(np.arange(SHAPE[0]), np.arange(SHAPE[1])) % 2 == 0, 0.06, -0.06)

@@ -409,7 +409,7 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
         ),
         noise=NoiseModel(
             spread=spread_estimate(fit),
-            white_fraction=float(np.clip(np.nan_to_num(np.nanmean(fit.white_fraction)), 0.0, None)),
+            white_fraction=_white_fraction(fit),
             read_noise_DN=_root_estimate(read_DN2, fit.read_sd_DN2, fit.most_read_DN2),
             quantised=quantised,
             shared_gain_sd=fit.shared_gain_sd,
@@ -436,6 +436,16 @@ def spread_estimate(fit: SpreadFit) -> SpreadEstimate:
             if name == "sigma_px" or sd > 0
         },
     )
+
+
+def _white_fraction(fit: SpreadFit) -> float:
+    """White noise that follows the signal over that of quanta, at the mean gain: it is the same in all beams, DN."""
+    lit = np.isfinite(fit.white_fraction) & (fit.gain_DN > 0)
+    if not lit.any():
+        return 0.0
+    white = np.clip(fit.white_fraction[lit], 0.0, None)
+    white_DN = float(np.mean(fit.gain_DN[lit] * white / (1.0 + white)))
+    return white_DN / max(float(np.exp(np.mean(np.log(fit.gain_DN[lit])))) - white_DN, 1e-3 * white_DN)
 
 
 def _root_estimate(variance: float, sd: float, most: float) -> Estimate:

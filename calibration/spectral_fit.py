@@ -29,7 +29,7 @@ from ..generator.line.spectral_signal import (
     attenuation_scale_name,
 )
 from ..generator.line.twin import Level, NoiseModel, SpectralPosterior
-from ..generator.line.twin_spectrum import slope_over_gain
+from ..generator.line.twin_spectrum import secondary_of_levels, slope_over_gain
 from ..spectra import BIN_WIDTH_KEV, Spectrum
 from .dose_data import (
     DOSE_FILTRATION,
@@ -244,6 +244,7 @@ def model_for(
     model_name: str = "casim",
     correction: SpectrumCorrection | None = None,
     more_names: Sequence[str] = (),
+    secondary_DN: float = 0.0,
 ) -> SpectralModel:
     """The spectral model of a declared instrument; what it leaves open takes the defaults (W, 12 degrees).
 
@@ -263,6 +264,7 @@ def model_for(
         filter_materials=sorted({*materials, "Al", "Cu"}),
         highest_kV=max(160.0, highest_kV),
         correction=correction,
+        secondary_DN=secondary_DN,
     )
     return result.with_parameters(more_names) if more_names else result
 
@@ -376,6 +378,7 @@ def fit_spectrum(
         model_name=model_name,
         correction=correction,
         more_names=dose_parameters(kermas, ratios, with_flats=bool(known)),
+        secondary_DN=0.0 if noise is None else secondary_of_levels(known, noise) or 0.0,
     )
     priors = priors_for(
         model,
@@ -438,6 +441,7 @@ def fit_spectrum(
             level_discrepancy=own.get("level", LEVEL_DISCREPANCY),
             gain_discrepancy=own.get("gain", GAIN_DISCREPANCY),
             kerma_discrepancy=own.get("kerma"),
+            secondary_DN=model.secondary_DN,
             calibrated_kV=(min(voltages), max(voltages)),
             calibrated_filters=tuple(sorted({text_from_filters(filters) for filters in measured})),
         ),

@@ -36,8 +36,12 @@ from .spread_families import (
 
 FloatArray = NDArray[np.float64]
 # White noise proportional to signal beside the quanta (secondary quanta): 1/K of the quantum variance for K electrons a
-# quantum, K = 100-1000; the width leaves room for other white noise that follows the signal.
+# quantum, K = 100-1000; the width leaves room for other white noise that follows the signal. Screens seen by a lens give a few
+# electrons: the prior is Student's t, with the degrees of freedom that Lange, Little and Taylor (J. Am. Stat. Assoc. 84 (1989)
+# 881) take.
 WHITE_FRACTION_PRIOR = (0.003, 0.03)
+_WHITE_DEGREES = 4.0
+_WHITE_ROUNDS = 8  # of weights that follow the prior's tail
 _LOW_BAND = 0.2  # cycles a pixel, up to which the second route extrapolates to 0
 _SILENT = 1e-6  # of the brightest series' power: below that a series is known as well as can be used
 _MOST_STEPS = 30
@@ -211,13 +215,13 @@ class _Normal:
             # the one that would be most negative in its own standard deviations goes first
             free[min(negative, key=lambda place: found[place] * math.sqrt(self.matrix[place, place]))] = False
 
-    def with_white_prior(self, gains: FloatArray) -> "_Normal":
-        """With the prior of the white parts, relative to gains (group,)."""
+    def with_white_prior(self, prior: "_WhitePrior") -> "_Normal":
+        """With a prior of the white parts."""
         matrix = self.matrix.copy()
-        centre, width = WHITE_FRACTION_PRIOR
-        for group, gain in enumerate(gains):
-            row = np.array([-centre, 1.0]) / (max(abs(float(gain)), 1e-12) * width)
-            both = [group, len(gains) + group]
+        groups = len(prior.sd_DN)
+        for group, sd in enumerate(prior.sd_DN):
+            row = np.array([-WHITE_FRACTION_PRIOR[0], 1.0]) / sd
+            both = [group, groups + group]
             matrix[np.ix_(both, both)] += np.outer(row, row)
         return replace(self, matrix=matrix)
 
@@ -225,6 +229,36 @@ class _Normal:
         """Inverse of the matrix."""
         scale = np.sqrt(np.clip(np.diag(self.matrix), 1e-300, None))
         return np.asarray(np.linalg.pinv(self.matrix / np.outer(scale, scale), rcond=1e-10) / np.outer(scale, scale))
+
+
+@dataclass(frozen=True, slots=True)
+class _WhitePrior:
+    """Student's t of the white parts: scale_DN (group,), the width about its middle; sd_DN (group,), that of the normal of the same
+    slope where they are."""
+
+    scale_DN: FloatArray
+    sd_DN: FloatArray
+
+    @classmethod
+    def about(cls, gains: FloatArray) -> "_WhitePrior":
+        """Of white parts as expected beside these gains (group,)."""
+        scale = np.maximum(np.abs(gains), 1e-12) * WHITE_FRACTION_PRIOR[1]
+        return cls(scale, scale)
+
+    def at(self, coefficients: FloatArray) -> "_WhitePrior":
+        """Where these coefficients are."""
+        beyond = self._beyond(coefficients) / math.sqrt(_WHITE_DEGREES + 1.0)
+        return replace(self, sd_DN=np.hypot(self.scale_DN, beyond))
+
+    def excess(self, coefficients: FloatArray) -> float:
+        """What -2 ln of Student's t has more than the normal's there."""
+        squared = self._beyond(coefficients) ** 2
+        exact = (_WHITE_DEGREES + 1.0) * np.log1p(squared / ((_WHITE_DEGREES + 1.0) * self.scale_DN**2))
+        return float(np.sum(exact - squared / self.sd_DN**2))
+
+    def _beyond(self, coefficients: FloatArray) -> FloatArray:
+        quantum, white = np.split(coefficients[: 2 * len(self.scale_DN)], 2)
+        return np.asarray(white - WHITE_FRACTION_PRIOR[0] * quantum)
 
 
 def _most_of_power(measured: FloatArray, modes: FloatArray, cells: int) -> FloatArray:
@@ -408,8 +442,18 @@ class _Problem:
         """
         normal, least_0 = self.normal(self.in_cells(spread)), (*self.not_negative, *also)
         # the sum is the gain, known even where the two cannot be told apart
-        gains = self.gains(normal.solved(least_0)[0])
-        return normal.with_white_prior(gains).solved(least_0)
+        prior = _WhitePrior.about(self.gains(normal.solved(least_0)[0]))
+        for _ in range(_WHITE_ROUNDS):
+            coefficients, chi_square = normal.with_white_prior(prior).solved(least_0)
+            there = prior.at(coefficients)
+            if np.all(np.abs(there.sd_DN - prior.sd_DN) < _SETTLED * prior.sd_DN):
+                break
+            prior = there
+        return coefficients, chi_square + prior.excess(coefficients)
+
+    def white_prior(self, coefficients: FloatArray) -> "_WhitePrior":
+        """Prior of the white parts, as it is at these coefficients."""
+        return _WhitePrior.about(self.gains(coefficients)).at(coefficients)
 
     @property
     def not_negative(self) -> range:
@@ -545,7 +589,7 @@ def _fitted(problem: _Problem, family: str, starts: Sequence[FloatArray], *, fix
     coefficients, _ = problem.solve(spread)
     normal = problem.normal(
         problem.in_cells(spread), coefficients[: problem.groups], _slopes(problem, family, theta, free)
-    ).with_white_prior(problem.gains(coefficients))
+    ).with_white_prior(problem.white_prior(coefficients))
     linear = len(coefficients)
     places = [*range(linear), *(linear + place for place in free)]
     covariance = np.zeros((linear + len(names), linear + len(names)))
@@ -616,7 +660,7 @@ def _descended(
             problem.in_cells(FAMILIES[family].spread(theta)),
             coefficients[: problem.groups],
             _slopes(problem, family, theta, free),
-        ).with_white_prior(problem.gains(coefficients))
+        ).with_white_prior(problem.white_prior(coefficients))
         step = np.zeros(len(theta))
         step[list(free)] = normal.solved(problem.not_negative)[0][-len(free) :]
         for share in (1.0, 0.5, 0.25, 0.1, 0.03):
@@ -653,7 +697,7 @@ def _learn_changes(problem: _Problem, item: _Candidate) -> None:
         problem.in_cells(item.spread),
         coefficients[: problem.groups],
         _slopes(problem, item.family, item.theta, range(len(item.theta))),
-    ).with_white_prior(problem.gains(coefficients))
+    ).with_white_prior(problem.white_prior(coefficients))
     problem.learn_changes(normal, max(1.0, chi_square / problem.independent))
 
 
@@ -986,7 +1030,7 @@ def _drifting(problem: _Problem, candidate: _Candidate) -> tuple[int, ...]:
     always = problem.drifting
     problem.drifting = lit
     coefficients, _ = problem.solve(candidate.spread)
-    normal = problem.normal(problem.in_cells(candidate.spread)).with_white_prior(problem.gains(coefficients))
+    normal = problem.normal(problem.in_cells(candidate.spread)).with_white_prior(problem.white_prior(coefficients))
     covariance = normal.covariance()
     problem.drifting = always
     first = 2 * problem.groups + 1

@@ -1,6 +1,7 @@
 """The spectral posterior: derivatives, intervals that hold for lines drawn from the priors, tables, wedges, spectra."""
 
 import math
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +26,9 @@ from raytwin.calibration.spectral_fit import (
 )
 from raytwin.errors import FitError, InputError
 from raytwin.generator.line.spectral_signal import OpenBeam, SpectralModel
-from raytwin.generator.line.twin import Estimate, Level, estimate_from_sd
+from raytwin.generator.line.twin import Estimate, Level, NoiseModel, SpreadEstimate, estimate_from_sd
+from raytwin.generator.line.twin_spectrum import model_of_posterior
+from raytwin.generator.spread.psf import Spread
 from raytwin.materials import transmission
 from raytwin.spectra import Spectrum, detector_response, energy_grid_keV, tube_spectrum
 
@@ -52,6 +55,13 @@ def from_prior(model, rng):
     full = draw_parameters(priors_for(model, scintillator_declared=True), 1, rng)[0]
     full[model.names.index("log_DN_per_keV")] = math.log(0.1)
     return full
+
+
+def with_secondary(model, secondary_DN):
+    """The same tube and detector, whose secondary quanta add this much variance per signal."""
+    result = copy(model)
+    result.secondary_DN = secondary_DN
+    return result
 
 
 def typical(model, **values):
@@ -91,8 +101,10 @@ def levels_of(model, parameters, beams, rng=None):
     return found
 
 
-def test_derivatives_are_those_of_the_signal(model):
+@pytest.mark.parametrize("secondary_DN", [0.0, 2.0])
+def test_derivatives_are_those_of_the_signal(model, secondary_DN):
     rng = np.random.default_rng(1)
+    model = with_secondary(model, secondary_DN)
     names = [name for name in model.names if name not in SHAPE_PARAMETERS]
     # as the fit takes them: the filtration, scintillator and voltage of a draw, the rest at the prior's centre
     samples = np.array([typical(model) for _ in range(5)])
@@ -180,6 +192,36 @@ def test_intervals_hold_for_lines_drawn_from_the_priors(model):
             )
     # two beams of a line go together: bounds as if only the lines counted, at 1e-3
     assert inside / 2 >= binom.ppf(1e-3, lines, 0.95)
+
+
+def test_photons_are_counted_by_the_noise_of_quanta_alone(model):
+    """Two electrons a photon at 60 kV double what the levels' gains say of noise, and change no number of photons."""
+    truth = typical(model)
+    quanta_DN = float(model.signal(truth[None, :], OpenBeam(kV=60.0, filters=())).gain_DN[0])
+    spread = Spread(sigma_px=0.5)
+    electron_DN, left = quanta_DN / 2.0, spread.variance_share
+    levels = [
+        replace(item, photon_transfer_slope_DN=estimate_from_sd(slope, 0.003 * slope))
+        for item in levels_of(with_secondary(model, electron_DN), truth, BEAMS)
+        for slope in [left * (item.gain_DN.value - electron_DN) + electron_DN]
+    ]
+    mean_gain = math.exp(float(np.mean([math.log(item.gain_DN.value) for item in levels])))
+    noise = NoiseModel(
+        spread=SpreadEstimate(value=spread),
+        white_fraction=electron_DN / (mean_gain - electron_DN),
+        read_noise_DN=estimate_from_sd(5.0, 0.01),
+        quantised=False,
+    )
+    fit = fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(3), noise=noise)
+    assert fit.posterior.secondary_DN == pytest.approx(electron_DN, rel=1e-9)
+    assert fit.chi_square < 2.0 * fit.data
+    for kV in (40.0, 60.0, 90.0):
+        beam = OpenBeam(kV=kV, filters=())
+        found = model_of_posterior(fit.posterior).signal(fit.posterior.samples, beam)
+        exact = model.signal(truth[None, :], beam)
+        low, high = np.quantile(found.absorbed_per_mAs, [0.025, 0.975])
+        assert low < exact.absorbed_per_mAs[0] < high < 1.5 * low
+        assert np.median(found.gain_DN) == pytest.approx(exact.gain_DN[0] + electron_DN, rel=0.02)
 
 
 @pytest.mark.parametrize("escape", [-1.0, 0.1])

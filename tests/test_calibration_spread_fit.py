@@ -19,12 +19,12 @@ PLAN = ((200.0, 8.0, 0), (1000.0, 8.0, 0), (500.0, 14.0, 1), (3000.0, 14.0, 1), 
 GROUPS = [group for *_, group in PLAN]
 
 
-def powers(spread, *, seed=0, count=8, interference_DN=0.0):
+def powers(spread, *, seed=0, count=8, interference_DN=0.0, white=WHITE):
     rng = np.random.default_rng(seed)
     found = []
     for signal, gain, _ in PLAN:
         level = np.full(SHAPE, signal)
-        noise = {"gain_DN": gain, "white_fraction": WHITE, "read_variance_DN2": READ_DN2, "spread": spread, "rng": rng}
+        noise = {"gain_DN": gain, "white_fraction": white, "read_variance_DN2": READ_DN2, "spread": spread, "rng": rng}
         frames = np.stack([level + sample_frame_noise(level, **noise) for _ in range(count)])
         # a wave of one frequency, its phase another in each frame
         rows, columns = np.indices(SHAPE)
@@ -97,6 +97,18 @@ def test_gains_slopes_and_read_noise_lie_within_their_own_standard_deviations(na
     assert fit.chi_square < 1.6 * fit.degrees
     # the family follows the evidence; of short tails frames of this size leave the form open
     FAMILIES.get(name, lambda fit: None)(fit)
+
+
+def test_few_electrons_a_photon_are_white_noise_and_no_tail_of_the_spread():
+    """Two a photon, as where a lens looks at the screen: sixteen standard deviations from what other panels have."""
+    spread, white = Spread(sigma_px=0.8), 0.5
+    fit = fit_spread(powers(spread, seed=7, white=white), group=GROUPS)
+    for place, gain in enumerate((8.0, 14.0)):
+        assert abs(fit.gain_DN[place] - gain) < 3.0 * fit.gain_sd_DN[place]
+        assert fit.gain_sd_DN[place] < 0.2 * gain
+        assert fit.white_fraction[place] == pytest.approx(white, rel=0.15)
+    assert abs(fit.sigma_px - spread.sigma_px) < 3.0 * fit.sigma_sd_px
+    assert fit.chi_square < 1.6 * fit.degrees
 
 
 @pytest.mark.slow

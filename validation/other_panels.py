@@ -49,7 +49,8 @@ class Panel:
     """What differs from a plain panel.
 
     Fields: on_light: frames (frame, row, column) of light, DN, with a generator; on_frames: the same with dark and electronic noise;
-    read_DN; averaged: exposures a frame; dark_DN_per_ms with its shot noise (gain of 1 DN); currents_mA: of the calibrating flats.
+    read_DN; averaged: exposures a frame; dark_DN_per_ms with its shot noise (gain of 1 DN); electron_DN: what one of few electrons
+    gives, 0: there are many; currents_mA: of the calibrating flats.
     """
 
     on_light: Callable[[np.ndarray, np.random.Generator], np.ndarray] = lambda light, _: light
@@ -57,6 +58,7 @@ class Panel:
     read_DN: float = 8.0
     averaged: int = 1
     dark_DN_per_ms: float = 0.0
+    electron_DN: float = 0.0
     currents_mA: tuple[float, ...] = CALIBRATING_mA
 
 
@@ -114,6 +116,7 @@ CASES = {
     "means_of_4": Panel(averaged=4, read_DN=1.5),
     "dim": Panel(read_DN=12.0, currents_mA=(0.02, 0.05, 0.1, 0.2)),
     "dark_current": Panel(dark_DN_per_ms=0.1),
+    "few_electrons": Panel(electron_DN=2.3),  # two a photon at 80 kV
     "noise_in_patches": Panel(read_DN=12.0 / np.sqrt(2), on_frames=in_patches),
 }
 
@@ -135,6 +138,8 @@ class Lab:
             mean = DN_PER_keV * energy * current_mA * EXPOSURE_ms / 1000
             light = gain / count * rng.poisson(mean * count / gain, light.shape)
             light = panel.on_light(gaussian_filter(light, (0, SPREAD_px, SPREAD_px), mode="wrap"), rng)
+            if panel.electron_DN > 0:
+                light = panel.electron_DN / count * rng.poisson(np.maximum(light, 0) * count / panel.electron_DN)
         dark = panel.dark_DN_per_ms * EXPOSURE_ms
         noise = np.sqrt((panel.read_DN**2 + 1 / 12 * (count > 1) + dark) / count) * rng.standard_normal(light.shape)
         return np.clip(np.rint(panel.on_frames(light + self.offset_DN + dark + noise, rng)), 0, 65535)
@@ -172,12 +177,16 @@ def judged(name: str, seed: int, folder: Path) -> str:
     for level in found["levels"]:
         _, energy, squares = beam(level["kV"])
         half = (level["gain_DN_high"] - level["gain_DN_low"]) / 2
-        off.append((level["gain_DN"] - DN_PER_keV * squares / energy / SWANK) / half)
+        off.append((level["gain_DN"] - DN_PER_keV * squares / energy / SWANK - panel.electron_DN) / half)
     width = half / level["gain_DN"]
     truth = {"noise_in_patches": 12.0}.get(name, panel.read_DN)
     read = found["read_noise_DN"]
     text = f"worst gain {max(off, key=abs):+.1f} half widths of {100 * width:.1f} %; read noise {read['value']:.4g}"
     text += f" ({read['low']:.4g} to {read['high']:.4g}) of {truth:.4g} DN"
+    photons = rt.predict(twin, kV=80.0, filter="Al:2", current_mA=1.0, exposure_ms=EXPOSURE_ms).to_dict()[
+        "photons_absorbed"
+    ]
+    text += f"; {photons['value']:.0f} photons ({photons['low']:.0f} to {photons['high']:.0f}) of {beam(80.0)[0] * EXPOSURE_ms / 1000:.0f}"
     share = rt.validate(twin, path).to_dict()["coverage"]
     return f"{text}; held back inside: means {100 * share['mean']:.0f} %, noise {100 * share['sd']:.0f} % of {share['rows']}"
 

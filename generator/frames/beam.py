@@ -162,7 +162,7 @@ def project_beam(
         return BeamProjection(
             open_signal_DN=signal_scale * float(spectrum.weights[0].sum()),
             signal_DN=signal,
-            variance_DN2=signal_scale * gain_scale * maps[1],
+            variance_DN2=signal_scale * gain_scale * maps[1] + secondary * signal,
             secondary_DN=secondary,
             picture=picture,
             spectrum=spectrum,
@@ -185,7 +185,7 @@ def _spectrum(
     shape, scales = _split(model, parameters, beam)
 
     def weighed() -> FloatArray:
-        weights = model.moment_weights(shape, beam)[:2]
+        weights = model.moment_weights(shape, beam, secondary=False)[:2]
         share = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
         return np.asarray(np.where(share > _LEAST_WEIGHT, weights, 0.0))
 
@@ -261,13 +261,13 @@ def _level(
     scales: tuple[float, float, float],
     cache: ModelCache,
 ) -> tuple[float, float, float]:
-    """Factors on the projected signal, and on variance over signal, of one exposure; secondary quanta's part, DN."""
+    """Factors on the projected signal, and on the quanta's variance over signal, of one exposure; secondary quanta's part, DN."""
     posterior = twin.spectral
     if posterior is None or request.setting is None:
         raise _no_level(request)
 
     def of_best() -> tuple[float, float, float]:
-        """Signal, variance over signal and DN a keV of the posterior's best parameters, for 1 mAs at 1 m on 1 mm2."""
+        """Signal, the quanta's variance over it and DN a keV of the posterior's best parameters, for 1 mAs at 1 m on 1 mm2."""
         best, best_scales = _spectrum(model, np.asarray(posterior.best, dtype=np.float64), beam, {}, cache)
         sums = best.weights.sum(axis=1)
         if not sums[0] > 0:
@@ -278,15 +278,15 @@ def _level(
             )
         return best_scales[0] * float(sums[0]), best_scales[1] * float(sums[1]) / float(sums[0]), best_scales[2]
 
-    best_rate, best_gain, best_gamma = cache.made("level", (posterior,), beam, of_best)
+    best_rate, best_quanta, best_gamma = cache.made("level", (posterior,), beam, of_best)
     distance = _distance_mm(twin, request, level)
     load = request.setting.tube_load_mAs
     pitch = twin.instrument.pixel_mm or 1.0
-    gain_scale = scales[1]
-    secondary = white_gain_DN(twin, best_gain)
+    gain = best_quanta + posterior.secondary_DN
+    secondary = white_gain_DN(twin, gain)
     if level is not None:
         gain, secondary = gain_of_slope(twin, level.photon_transfer_slope_DN.value)
-        gain_scale *= gain / best_gain
+    gain_scale = scales[1] * (gain - secondary) / best_quanta
     # electronics that give more DN for a keV give more for a secondary quantum too
     secondary *= scales[2] / best_gamma
     if request.open_signal_DN is not None:

@@ -4,7 +4,7 @@ Per mAs, at distance d, on a pixel of pitch a (mean deposited energy m1(E), its 
 fraction D(E)):
 
     N(E)    = kappa Phi(E; kV (1 + e)) (kV / 60)^x (E / 50)^(h + u ln(kV / 60)) (2 - 2 E / kV)^s exp(-sum mu t) (1000 / d)^2 a^2
-    signal  = gamma sum N c l m1    gain = (gamma / A_S) sum N c l^2 m2 (E / 50)^-w / sum N c l m1    absorbed = sum N c D
+    signal  = gamma sum N c l m1    gain = (gamma / A_S) sum N c l^2 m2 (E / 50)^-w / sum N c l m1 + W    absorbed = sum N c D
 
 for energy-integrating detectors; a counting detector has m1 = m2 = D and l = 1. gamma is in DN per keV absorbed, s how much
 steeper than SpekPy's a spectrum falls to its end point (E below 0.98 kV), e = kV_error + kV_tilt ln(kV / 60), and mu that of
@@ -177,8 +177,9 @@ class SpectralModel:
 
     `names` are the parameters, in the order of a parameter set; a set of fewer names (an older twin's) can be given, and
     what it lacks counts as 0. `correction` brings the tube model to measured spectra. `alternative` is another
-    scintillator, which a parameter of value 1 puts in place of the first where the sheet does not say. The state is a
-    cache: what each kV and material looks like on the common grid.
+    scintillator, which a parameter of value 1 puts in place of the first where the sheet does not say. `secondary_DN` is
+    what secondary quanta add to the variance per signal in every beam. The state is a cache: what each kV and material looks
+    like on the common grid.
     """
 
     def __init__(
@@ -196,6 +197,7 @@ class SpectralModel:
         highest_kV: float = 160.0,
         names: Sequence[str] | None = None,
         correction: SpectrumCorrection | None = None,
+        secondary_DN: float = 0.0,
     ) -> None:
         self.anode = anode
         self.anode_angle_deg = anode_angle_deg
@@ -207,6 +209,7 @@ class SpectralModel:
         self.counting = counting
         self.filter_materials = tuple(filter_materials)
         self.correction = correction
+        self.secondary_DN = secondary_DN
         every = [*FIXED_PARAMETERS, *(_RESPONSE_OF_COUNTERS if counting else RESPONSE_PARAMETERS)]
         every += [ALTERNATIVE_SCINTILLATOR] if self.alternative else []
         for material in self.filter_materials:
@@ -451,8 +454,15 @@ class SpectralModel:
             photons = np.repeat(photons, len(stacks), axis=0)
         return self.signal_of_photons(parameters[None, :], photons)
 
-    def moment_weights(self, parameters: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
-        """What each energy of an open beam adds to signal (DN), quantum variance (DN^2) and photons absorbed.
+    def moment_weights(
+        self, parameters: NDArray[np.float64], beam: OpenBeam, *, secondary: bool = True
+    ) -> NDArray[np.float64]:
+        """What each energy of an open beam adds to signal (DN), its variance (DN^2) and photons absorbed.
+
+        Args:
+            parameters: (parameter,), one set.
+            beam: kV and filters.
+            secondary: whether the variance holds that of secondary quanta.
 
         Returns:
             (3, energy) a mAs and mm2 of pixel at 1 m, on the first of `energies_keV`, for one parameter set (parameter,).
@@ -463,9 +473,11 @@ class SpectralModel:
         first, second, share = self._moments(samples)[:, 0, : len(photons)]
         log_gamma = float(self._column(samples, "log_DN_per_keV")[0])
         log_swank = float(self._column(samples, "log_swank")[0])
-        return np.stack(
-            [photons * first * np.exp(log_gamma), photons * second * np.exp(2 * log_gamma - log_swank), photons * share]
-        )
+        signal = photons * first * np.exp(log_gamma)
+        variance = photons * second * np.exp(2 * log_gamma - log_swank)
+        if secondary:
+            variance = variance + self.secondary_DN * signal
+        return np.stack([signal, variance, photons * share])
 
     def deposit_tables(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
         """What each draw's scintillator does at each energy (6, draw, energy): see `_response_tables`, the share left out.
@@ -554,7 +566,7 @@ class SpectralModel:
         excess = np.exp(log_gamma - self._column(samples, "log_swank"))
         return BeamSignal(
             rate_DN_per_mAs=gamma * first,
-            gain_DN=excess * second / first,
+            gain_DN=excess * second / first + self.secondary_DN,
             absorbed_per_mAs=absorbed,
             # photons are per mm2, kerma counts per cm2
             kerma_uGy_per_mAs=100.0 * (photons @ self._kerma[:top]) * np.exp(self._column(samples, KERMA_OUTPUT)),
@@ -667,7 +679,9 @@ class SpectralModel:
                 mean = powers[0] * self._mean_of_row(name, by_first, samples) / sums[0] if powers[0] else 0.0
                 rate[:, column] = mean
                 gain[:, column] = powers[1] * self._mean_of_row(name, by_second, samples) / sums[1] - mean
-        return logs, rate, gain
+        quanta = np.exp(logs[1])
+        logs[1] = np.log(quanta + self.secondary_DN)
+        return logs, rate, gain * (quanta / (quanta + self.secondary_DN))[:, None]
 
     def _mean_of_row(self, name: str, weight: NDArray[np.float64], samples: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum over energy of a response parameter's row times weights (draw, energy), each draw's own scintillator (draw,)."""

@@ -230,7 +230,8 @@ class SpectralPosterior(ByValue):
     anode_angle_deg, model, inherent (vendor's layers), scintillator, cover, counting: the frame of the model; alternative:
     the scintillator of draws that have another one (where nobody declared it); level_discrepancy, gain_discrepancy: relative
     sd of a single level and gain beyond the parameters; kerma_discrepancy: of a single setting's air kerma (None: no dosimeter
-    was read); correction: of the tube model by measured spectra, if there were any.
+    was read); correction: of the tube model by measured spectra, if there were any; secondary_DN: variance per signal that
+    secondary quanta add to the gain of every beam.
     """
 
     names: tuple[str, ...]
@@ -252,6 +253,7 @@ class SpectralPosterior(ByValue):
     alternative: tuple[Filter, ...] = ()
     correction: SpectrumCorrection | None = None
     kerma_discrepancy: float | None = None
+    secondary_DN: float = 0.0
 
     def column(self, name: str) -> NDArray[np.float64]:
         """Draws of one parameter (draw,)."""

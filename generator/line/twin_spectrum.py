@@ -13,12 +13,10 @@ from ...errors import InputError
 from .spectral_signal import SpectralModel, attenuation_scale_name
 from .twin import Level, NoiseModel, SpectralPosterior, Twin
 
-_LARGEST_SECONDARY = 0.06  # of the gain
-
 
 @lru_cache(maxsize=8)
 def _cached_model(key: tuple[Any, ...], highest_kV: float) -> SpectralModel:
-    anode, angle, model, inherent, scintillator, alternative, cover, counting, names, correction = key
+    anode, angle, model, inherent, scintillator, alternative, cover, counting, names, correction, secondary_DN = key
     prefix = attenuation_scale_name("")
     return SpectralModel(
         anode=anode,
@@ -33,6 +31,7 @@ def _cached_model(key: tuple[Any, ...], highest_kV: float) -> SpectralModel:
         highest_kV=highest_kV,
         names=names,
         correction=correction,
+        secondary_DN=secondary_DN,
     )
 
 
@@ -74,6 +73,7 @@ def model_of_posterior(posterior: SpectralPosterior, *, highest_kV: float = 160.
         posterior.counting,
         posterior.names,
         posterior.correction,
+        posterior.secondary_DN,
     )
     return _cached_model(key, max(160.0, 20.0 * math.ceil(highest_kV / 20.0)))
 
@@ -113,24 +113,32 @@ def slope_over_gain(
         return None
     slopes, gains = np.log(np.array(known)).mean(axis=0)
     share, mean_gain = math.exp(slopes - gains), math.exp(gains)
-    left = noise.spread.value.variance_share
-    white = (share - left) / (1.0 - left) if left < 0.999 else 0.0
-    if not 0.0 <= white <= _LARGEST_SECONDARY:
-        white = 0.0  # no noise of secondary quanta, but a spread that is not Gaussian
-    constant = (1.0 - left) * white / share  # of the slope at the mean gain: does not grow with the gain
+    white = noise.white_fraction / (1.0 + noise.white_fraction)
+    # of the slope at the mean gain: does not grow with the gain
+    constant = (1.0 - noise.spread.value.variance_share) * white / share
     return np.asarray(share * (1.0 + constant * (mean_gain / np.asarray(gain_DN) - 1.0)))
 
 
+def secondary_of_levels(levels: Sequence[Level], noise: NoiseModel) -> float | None:
+    """Variance per signal that secondary quanta add in every beam, DN: the noise's white share of the levels' mean gain.
+
+    None: there is no level with a gain.
+    """
+    known = [math.log(level.gain_DN.value) for level in levels if level.gain_DN.value > 0]
+    if not known:
+        return None
+    return noise.white_fraction / (1.0 + noise.white_fraction) * math.exp(sum(known) / len(known))
+
+
 def white_gain_DN(twin: Twin, gain_DN: float) -> float:
-    """Variance per signal that secondary quanta add in every beam, DN: the spread's white share of the levels' mean gain.
+    """Variance per signal that secondary quanta add in every beam, DN (`secondary_of_levels`).
 
     Args:
         twin: the calibrated line.
         gain_DN: of the beam, whose own share counts where the twin has no levels.
     """
-    white = twin.noise.white_fraction / (1.0 + twin.noise.white_fraction)
-    known = [math.log(level.gain_DN.value) for level in twin.levels if level.gain_DN.value > 0]
-    return white * (math.exp(sum(known) / len(known)) if known else gain_DN)
+    found = secondary_of_levels(twin.levels, twin.noise)
+    return twin.noise.white_fraction / (1.0 + twin.noise.white_fraction) * gain_DN if found is None else found
 
 
 def gain_of_slope(twin: Twin, slope_DN: float) -> tuple[float, float]:

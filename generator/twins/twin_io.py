@@ -175,7 +175,15 @@ def _put_spectral(file: Any, posterior: SpectralPosterior) -> None:
     spectral.attrs["names"] = json.dumps(list(posterior.names))
     spectral.attrs["prior"] = json.dumps(dict(posterior.prior))
     spectral.attrs["undetermined"] = json.dumps(list(posterior.undetermined))
-    for name in ("anode", "anode_angle_deg", "model", "counting", "level_discrepancy", "gain_discrepancy"):
+    for name in (
+        "anode",
+        "anode_angle_deg",
+        "model",
+        "counting",
+        "level_discrepancy",
+        "gain_discrepancy",
+        "secondary_DN",
+    ):
         spectral.attrs[name] = getattr(posterior, name)
     for name in ("inherent", "scintillator", "alternative", "cover"):
         spectral.attrs[name] = text_from_filters(getattr(posterior, name))
@@ -368,6 +376,7 @@ def _spectral_from_group(group: Any, path: object) -> SpectralPosterior:
         level_discrepancy=float(attributes["level_discrepancy"]),
         gain_discrepancy=float(attributes["gain_discrepancy"]),
         kerma_discrepancy=_optional_float(group, "kerma_discrepancy"),
+        secondary_DN=float(attributes.get("secondary_DN", 0.0)),
         calibrated_kV=(float(attributes["calibrated_kV"][0]), float(attributes["calibrated_kV"][1])),
         calibrated_filters=_texts(attributes["calibrated_filters"]),
     )

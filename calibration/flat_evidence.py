@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.setting import text_from_filters
 from .dark_frames import DarkFrames
-from .flat_levels import SeriesPoint, load_mAs_of
+from .flat_levels import SeriesPoint, load_mAs_of, scatter_of_flats
 from .noise_of_flats import FlatNoise
 from .noise_power import correlation_of_quanta
 from .repeated_frames import beam_of
@@ -99,6 +99,8 @@ def flat_evidence(
         "output_rms_percent": max((p.common_mode_percent for p in used), default=0.0),
         "repeated_settings": repeats,
         "linearity": linearity,
+        "scatter_of_flats": scatter_of_flats(used),
+        "scatter_of_noise": _scatter_of_noise(ratios, degrees=len(ratios) - len(fit.gain_DN) - 1),
         "dark": dark_levels,
         "line_noise_DN": {
             "rows": math.sqrt(fit.row_variance_DN2),
@@ -119,6 +121,19 @@ def flat_evidence(
         "photon_transfer": [point.as_dict() for point in points],
     }
     return evidence, warnings
+
+
+def _scatter_of_noise(ratios: Sequence[tuple[str, float, float]], *, degrees: int) -> dict[str, float] | None:
+    """By how much the noise power of a series strays from the fitted one beyond its sampling; ratios as in `_uneven`.
+
+    Returns:
+        relative_sd: standard deviation; degrees: of freedom. None: there are none.
+    """
+    known = [(ratio - 1.0, sd) for _, ratio, sd in ratios if math.isfinite(ratio)]
+    if degrees < 1 or not known:
+        return None
+    beyond = sum(off**2 for off, _ in known) / degrees - sum(sd**2 for _, sd in known) / len(known)
+    return {"relative_sd": math.sqrt(max(beyond, 0.0)), "degrees": float(degrees)}
 
 
 def _uneven(ratios: Sequence[tuple[str, float, float]], *, degrees: int) -> list[str]:

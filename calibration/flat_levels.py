@@ -214,6 +214,27 @@ def _rate(
     return estimate_from_sd(rate, math.sqrt(variance))
 
 
+def scatter_of_flats(points: Sequence[SeriesPoint]) -> dict[str, float] | None:
+    """By how much a flat's level strays from that of its beam's other flats, each over its load; None: no beam has two.
+
+    A response that bends, a dark that moved since, a current or a time that is not as set: all of them, as far as loads differ.
+
+    Returns:
+        relative_sd: standard deviation; degrees: of freedom.
+    """
+    groups: dict[tuple[Any, ...], list[float]] = {}
+    for point in points:
+        if point.used and point.load_mAs:
+            beam = (point.kV, tuple(sorted(map(str, point.filters))), point.source_detector_mm)
+            groups.setdefault(beam, []).append(point.signal_DN / point.load_mAs)
+    rates = [np.array(members) for members in groups.values() if len(members) > 1]
+    degrees = sum(len(one) - 1 for one in rates)
+    if degrees < 1:
+        return None
+    squares = sum(float(np.sum((one / one.mean() - 1.0) ** 2)) for one in rates)
+    return {"relative_sd": math.sqrt(squares / degrees), "degrees": float(degrees)}
+
+
 def median_variance(noise_variance: ArrayLike, *, spread_sd: ArrayLike, pixels: int) -> NDArray[np.float64]:
     """Variance of the median of a fixed map under noise, in the unit of `noise_variance`.
 

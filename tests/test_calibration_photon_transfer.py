@@ -89,6 +89,8 @@ def is_gain(estimate):
 
 def test_a_clean_session_gives_its_truth_and_no_warning(clean):
     assert clean.warnings == ()
+    assert clean.evidence["scatter_of_flats"]["relative_sd"] < 0.002
+    assert clean.evidence["scatter_of_noise"]["relative_sd"] < 0.01
     (level,) = clean.levels
     assert level.gain_DN.low < GAIN < level.gain_DN.high
     assert is_gain(level.gain_DN)
@@ -206,6 +208,15 @@ def test_a_nonlinear_detector_departs_from_the_line_in_load(tmp_path):
     found = planted(tmp_path, bend)
     assert found.evidence["linearity"]["largest_departure_percent"] > 1.0
     assert any("departs from a line" in line for line in found.warnings)
+    # loads of one beam, each over its level: what one more load strays by
+    used = [point for point in found.points if point.used]
+    rates = np.array([point.signal_DN / point.load_mAs for point in used])
+    scatter = found.evidence["scatter_of_flats"]
+    assert len({point.kV for point in used}) == 1
+    assert scatter["degrees"] == len(used) - 1
+    assert scatter["relative_sd"] == pytest.approx(np.std(rates / rates.mean(), ddof=1))
+    assert scatter["relative_sd"] > 0.02
+    assert found.evidence["scatter_of_noise"]["relative_sd"] > 0.02
 
 
 def test_a_flat_above_full_well_is_left_out_and_named(tmp_path):

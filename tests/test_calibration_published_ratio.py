@@ -108,6 +108,7 @@ def test_published_ratio_lies_inside_the_interval_predicted_before_calibration(s
     assert high < published_ratio() * 2.5
 
 
+@pytest.mark.slow
 def test_published_ratio_narrows_the_filtration_as_far_as_kV_and_scintillator_allow():
     model = model_of()
     before = prior_draws(model)[:, model.names.index("inherent_filtration_mm_Al")].std()

@@ -52,6 +52,7 @@ def emva_levels():
 
 
 @pytest.mark.skipif(not CCD.is_dir(), reason="the EMVA 1288 camera set is not here (shared/realdata/emva_ccd)")
+@pytest.mark.slow
 def test_gain_dark_noise_and_linearity_of_the_ccd_camera(tmp_path, capsys):
     answer = calibrated(CCD, "emva1288", tmp_path, capsys)
     photons, mean, variance, dark_variance, saturated = emva_levels().T

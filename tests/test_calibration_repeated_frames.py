@@ -151,6 +151,7 @@ def test_it_is_said_where_the_noise_comes_from_and_what_it_cannot_tell(found):
     assert "noise that has changed since the flats cannot be seen" in said
 
 
+@pytest.mark.slow
 def test_behind_objects_the_gain_is_harder_and_its_interval_says_so(tmp_path):
     covered = transfer_of(write_session(tmp_path / "covered.h5", share=1.0, exposures_ms=(20.0,)))
     (row,) = covered.evidence["repeated_frames"]
@@ -170,6 +171,7 @@ def test_objects_that_nobody_maps_are_read_away_from_steps(tmp_path):
     assert gain_DN.value == pytest.approx(mixed, rel=0.08)
 
 
+@pytest.mark.slow
 def test_repeated_flats_held_back_for_evaluation_give_the_whole_field(tmp_path):
     again = transfer_of(write_session(tmp_path / "again.h5", objects=0, flat_frames=12))
     (row,) = again.evidence["repeated_frames"]
@@ -178,6 +180,7 @@ def test_repeated_flats_held_back_for_evaluation_give_the_whole_field(tmp_path):
     assert again.levels[0].series == ("flat_20", "flat_80")
 
 
+@pytest.mark.slow
 def test_series_held_back_for_evaluation_stay_so_where_others_repeat_the_beam(tmp_path):
     free = transfer_of(write_session(tmp_path / "free.h5", role=None, flat_frames=12))
     (row,) = free.evidence["repeated_frames"]
@@ -282,6 +285,7 @@ def test_series_of_one_frame_over_and_over_are_refused_in_one_line(tmp_path):
         transfer_of(tmp_path / "copies.h5")
 
 
+@pytest.mark.slow
 def test_a_beam_with_repeated_flats_takes_nothing_from_objects(tmp_path):
     with_objects, without = tmp_path / "with.h5", tmp_path / "without.h5"
     for path, objects in ((with_objects, 2), (without, 0)):
@@ -300,6 +304,7 @@ def test_a_beam_with_repeated_flats_takes_nothing_from_objects(tmp_path):
     assert first.evidence == second.evidence
 
 
+@pytest.mark.slow
 def test_a_diagnosis_calibrates_such_a_session_and_knows_whose_noise_it_has(session):
     with open_acquisition(session) as acquisition:
         twin = calibrated_twin(acquisition, rng=np.random.default_rng(0))
@@ -324,6 +329,7 @@ def test_two_averaged_darks_bound_the_read_variance_whatever_their_pattern():
     assert most_read_variance(darks[:1], good) is None
 
 
+@pytest.mark.slow
 def test_pixels_that_jump_from_one_averaged_dark_to_the_next_are_noisy(tmp_path):
     rng = np.random.default_rng(3)
     jumping = {(20, 20): 30.0, (40, 7): 45.0}  # DN; the noise of a mean dark is a quarter of READ_DN

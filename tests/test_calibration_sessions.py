@@ -102,6 +102,7 @@ def test_one_session_has_no_evidence_of_sessions(tmp_path):
         assert "sessions" not in compute_photon_transfer(acquisition).evidence
 
 
+@pytest.mark.slow
 def test_more_frames_of_a_second_session_narrow_the_slope(tmp_path):
     first = session(tmp_path / "a.h5", seed=1)
     second = session(tmp_path / "b.h5", seed=2)

@@ -77,7 +77,7 @@ FAMILIES = {
 }
 
 
-SLOW = ("two widths", "Lorentzian tail", "tail of a layer that absorbs")
+SLOW = ("two widths", "Lorentzian tail", "exponential tail", "tail of a layer that absorbs")
 
 
 @pytest.mark.parametrize(
@@ -132,6 +132,7 @@ def test_a_series_with_the_noise_of_averages_widens_what_it_spoils():
     assert np.argmax(np.abs(np.array(ratios[:3]) - 1.0)) == 2
 
 
+@pytest.mark.slow
 def test_interference_in_the_electronics_is_noise_of_the_darks_and_no_reason_to_know_nothing():
     spread, amplitude = SPREADS["narrow"], 20.0
     fit = fit_spread(powers(spread, seed=3, interference_DN=amplitude), group=GROUPS)
@@ -144,7 +145,7 @@ def test_interference_in_the_electronics_is_noise_of_the_darks_and_no_reason_to_
     assert fit.chi_square < 2.0 * fit.degrees
 
 
-@pytest.mark.parametrize("aspect", [1.0, 1.2])
+@pytest.mark.parametrize("aspect", [1.0, pytest.param(1.2, marks=pytest.mark.slow)])
 def test_behind_a_screen_frames_of_a_simulation_are_known_as_such(aspect):
     """No screen counts quanta in pixels; simulations do, and say that they have one."""
     simulated = powers(Spread(model="sampled", sigma_px=0.55, aspect=aspect), count=16)
@@ -155,12 +156,14 @@ def test_behind_a_screen_frames_of_a_simulation_are_known_as_such(aspect):
         assert abs(fit.gain_DN[place] - gain) < 4.0 * fit.gain_sd_DN[place] < 0.2 * gain
 
 
+@pytest.mark.slow
 def test_a_real_screen_is_no_simulation():
     real = fit_spread(powers(SPREADS["exponential tail"]), group=GROUPS, screen=True)
     assert real.spread.model == "aperture"
     assert not any(item.value.model == "sampled" for item in real.others)
 
 
+@pytest.mark.slow
 def test_tails_of_a_simulation_are_known_where_its_core_alone_looks_like_a_screen():
     """Counts blurred by a Lorentzian: without a tail, light collected in pixels fits them better than counts do."""
     counted = Spread(model="sampled", tail_share=1.0, tail_px=0.4)
@@ -265,6 +268,7 @@ def test_bright_pairs_tell_how_much_of_dim_ones_is_a_change_of_the_beam():
     assert fits[0].gain_sd_DN[0] < 0.8 * fits[1].gain_sd_DN[0]
 
 
+@pytest.mark.slow
 def test_a_screen_is_never_taken_for_one_without_a_tail():
     """Frames too small to show a tail leave it open; its core is then not known better than that."""
     spread = Spread(sigma_px=0.7, tail_share=0.15, tail_px=1.0)

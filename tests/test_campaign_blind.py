@@ -644,6 +644,7 @@ def many(tmp_path_factory):
     return check, score_check(check)
 
 
+@pytest.mark.slow
 def test_an_honest_fake_diagnosis_scores_as_it_should(many):
     _, result = many
     scores = result.scores["scores"]

@@ -47,6 +47,7 @@ def line(tmp_path_factory):
         return path, calibrate_twin(part, rng=np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_products_agree_with_a_twin_that_lacks_nothing_and_depart_from_one_with_scatter_that_is_not_there(line):
     path, twin = line
     scatter = (AppliedEffect(id="object_scatter", parameters={"strength": 30.0}),)

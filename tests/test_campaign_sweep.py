@@ -128,6 +128,7 @@ class Spy:
 # ---------------------------------------------------------------------------------------------------- the chain
 
 
+@pytest.mark.slow
 def test_a_row_stands_for_every_setting_tried_or_not(whole):
     folder, answer = whole
     assert [row["trained"] for row in answer["rows"]] == [False, True, True]
@@ -343,6 +344,7 @@ def test_a_folder_of_something_else_and_a_second_run_are_refused(line, whole, tm
         sweep(campaign, whole[0], Here())
 
 
+@pytest.mark.slow
 def test_the_report_shows_every_setting(line, whole):
     folder, answer = whole
     campaign = read_campaign(line / "campaign.toml")

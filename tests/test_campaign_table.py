@@ -374,6 +374,7 @@ def line_with_effect(monkeypatch):
     return run_line, ran
 
 
+@pytest.mark.slow
 def test_a_line_with_an_effect_stands_beside_the_table_before_and_after(line_with_effect, tmp_path):
     run_line, ran = line_with_effect
     plan, parts = EffectsPlan(effects=("motion_blur=4",)), []

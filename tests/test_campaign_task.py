@@ -79,6 +79,7 @@ def pictures(line, twin):
     return KnownScenes(twin, low=low, high=high, product_material="chicken_breast")
 
 
+@pytest.mark.slow
 def test_nothing_in_the_beam_gives_log_images_of_zero(line, twin):
     images = pictures(line, twin).expected({"chicken_breast": np.zeros(twin.maps.shape)})
     for image in images:
@@ -230,6 +231,7 @@ def test_an_effect_that_changes_no_image_leaves_a90_as_it_was_and_says_so(line, 
     assert stand_in[1] == [["before", "measured"]]
 
 
+@pytest.mark.slow
 def test_sizes_that_all_are_detected_at_give_null_with_a_warning(line, twin, tmp_path, stand_in, monkeypatch):
     def always(runs, dataset_path, out, contrast, thresholds, *, device):
         with read_dataset(dataset_path) as dataset, open(out, "w", newline="", encoding="utf-8") as stream:

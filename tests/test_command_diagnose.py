@@ -181,6 +181,7 @@ def passed(wanted, run):
     return found
 
 
+@pytest.mark.slow
 def test_frames_take_the_walks_of_the_architecture_page(tmp_path, make_tiny_session):
     session, twin = str(tmp_path / "session.h5"), str(tmp_path / "walked.h5")
     make_tiny_session(session)

@@ -96,6 +96,7 @@ def test_repeated_looks_are_crossed_by_default_and_false_alarms_counted(capsys, 
     assert "false alarms" in text
 
 
+@pytest.mark.slow
 def test_every_further_option_adds_its_part(capsys, tmp_path):
     table = write_hits(tmp_path / "HITS.csv", 3)
     words = ["pod", str(table), "--repeats", "cluster", "--ceiling", "--floor", "--bootstrap", "50", "--as-published"]

@@ -51,6 +51,7 @@ def test_plan_trains_nothing_and_tells_what_is_known_before(campaign, capsys):
     assert "2 settings, 1 feasible, 1 to train" in text and "22.7" in text
 
 
+@pytest.mark.slow
 def test_a_sweep_writes_its_answer_and_prints_the_same_rows_with_their_time(campaign, capsys, tmp_path):
     folder = tmp_path / "sweep"
     words = ["sweep", str(campaign), "-o", str(folder), "--json"]

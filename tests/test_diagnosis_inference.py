@@ -473,6 +473,7 @@ def test_a_pair_of_which_neither_variant_is_the_best_alone_is_found_by_turns():
     assert pair.strengths["gain_map"][0] == pytest.approx(15.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_an_effect_that_moves_probes_by_chance_alone_is_found_with_its_strength():
     rng = np.random.default_rng(12)
     spread = np.zeros((PROBES, 40))

@@ -106,6 +106,7 @@ def test_both_are_named_where_what_the_twin_has_is_gone(line):
     assert first.strengths["motion"][0] < 0.2 * STRENGTH
 
 
+@pytest.mark.slow
 def test_a_law_that_is_off_by_a_fifth_in_some_probes_leaves_no_gap(line):
     off = np.random.default_rng(3).standard_normal(20)[GROUPS] * 0.2
     shown = (1.0 + off) * line.motion

@@ -92,6 +92,7 @@ def test_an_edge_or_disc_is_asked_for_where_blur_of_the_source_ties_with_blur_of
     assert other.separation_then == pytest.approx(found.separation_then, rel=0.1)
 
 
+@pytest.mark.slow
 def test_beam_off_frames_are_asked_for_where_lag_ties_with_a_drifting_dark(problem):
     lag, drift = (at_strength(problem, effect) for effect in ("image_lag", "dark_drift"))
     found = best_measurement(problem, lag, drift, rng=np.random.default_rng(3))

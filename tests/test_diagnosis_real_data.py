@@ -40,6 +40,7 @@ def places(answer, axis, series, statistic):
 
 
 @pytest.mark.skipif(not K11.is_dir(), reason="the K11 tomography scan is not here (shared/realdata/k11)")
+@pytest.mark.slow
 def test_k11_flats_after_the_scan_are_brighter_and_the_tomogram_itself_cannot_be_judged(tmp_path, capsys):
     session, answer = diagnosed(K11 / "k11-18014.nxs", "nxtomo", tmp_path, capsys)
     with h5py.File(session) as file:

@@ -55,6 +55,7 @@ def diagnosed(line, tmp_path, capsys):
     return run
 
 
+@pytest.mark.slow
 def test_lines_move_later_means_by_chance_and_places_of_scenes_follow_no_law(line):
     with open_acquisition(line / "session.h5") as acquisition:
         problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=catalogue_variants())
@@ -374,6 +375,7 @@ def test_averaged_frames_of_darks_are_as_quiet_as_their_number_says(line, tmp_pa
     assert all(item.request.exposures_per_frame == item.series.averaged for item in session)
 
 
+@pytest.mark.slow
 def test_session_without_kV_is_judged_by_levels_and_noise_alone(diagnosed):
     code, answer, _ = diagnosed(without("kV"))
     assert code == 0

@@ -37,6 +37,7 @@ def diagnosed(tmp_path_factory):
     return run
 
 
+@pytest.mark.slow
 def test_darks_of_exact_zeros_are_compared_and_show_no_gap(diagnosed):
     found = diagnosed()
     assert found.verdict == "no_gap"

@@ -1,6 +1,7 @@
 """Many settings at once give what each gives alone, on a twin whose posterior is one parameter set."""
 
 import importlib.util
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -81,3 +82,35 @@ def test_without_a_spectrum_only_measured_levels_are_predicted_at_once(twin):
     assert known.mean_DN[0] == pytest.approx(23000.0 * 0.02)
     with pytest.raises(InputError, match="without spectral part"):
         predict_levels(plain, kV=[60.0], filters=FILTERS[:1], load_mAs=0.02)
+
+
+@pytest.mark.parametrize("kV", [90.0, 75.0])
+def test_flats_that_stray_from_their_beams_levels_widen_every_predicted_level(twin, kV):
+    """A response that bends shows as loads whose levels differ: one more load strays as they do, measured beam or not."""
+    setting = Setting(kV=kV, filters=filters_from_text("Cu:0.05"), current_mA=1.0, exposure_ms=10.0)
+
+    def relative_half_width(scatter):
+        line = replace(twin, evidence={**twin.evidence, "scatter_of_flats": scatter})
+        mean = predict_flatfield(line, setting).mean_DN
+        return (mean.high - mean.low) / 2.0 / mean.value
+
+    usual = relative_half_width(None)
+    steady = relative_half_width({"relative_sd": 1e-4, "degrees": 6.0})
+    straying = relative_half_width({"relative_sd": 0.01, "degrees": 6.0})
+    assert steady == usual
+    assert straying == pytest.approx(math.sqrt(usual**2 + 1.96**2 * (0.01**2 - 0.002**2)), rel=0.02)
+
+
+def test_series_whose_noise_strays_widen_every_predicted_noise(twin):
+    setting = Setting(kV=75.0, filters=filters_from_text("Cu:0.05"), current_mA=1.0, exposure_ms=10.0)
+
+    def relative_half_width(scatter):
+        line = replace(twin, evidence={**twin.evidence, "scatter_of_noise": scatter})
+        sd = predict_flatfield(line, setting).sd_DN
+        return (sd.high - sd.low) / 2.0 / sd.value
+
+    none = relative_half_width(None)
+    assert relative_half_width({"relative_sd": 0.0, "degrees": 4.0}) == none
+    # power strays by 6 %, noise by half of it
+    straying = relative_half_width({"relative_sd": 0.06, "degrees": 4.0})
+    assert straying == pytest.approx(math.hypot(none, 1.96 * 0.03), rel=0.02)

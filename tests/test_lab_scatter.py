@@ -93,7 +93,9 @@ def single_scatter_of_water(thickness_mm, system, *, keV=KEV):
     return total / scale**2 * system.pixel_mm**2
 
 
-@pytest.mark.parametrize(("thickness_mm", "gap_mm"), [(2.0, 350.0), (20.0, 350.0), (20.0, 100.0)])
+@pytest.mark.parametrize(
+    ("thickness_mm", "gap_mm"), [pytest.param(2.0, 350.0, marks=pytest.mark.slow), (20.0, 350.0), (20.0, 100.0)]
+)
 def test_single_scatter_of_a_slab_is_its_integral(thickness_mm, gap_mm):
     system = replace(SYSTEM, source_object_mm=1000.0 - gap_mm)
     found = scattered_by({"water": thickness_mm}, system=system)[0].sum(axis=2)

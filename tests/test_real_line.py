@@ -95,6 +95,7 @@ def test_the_page_of_the_real_line_runs(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.realdata
 @pytest.mark.skipif(not WHOLE.is_dir(), reason="the whole frames are not here (shared/realdata/flexray_walnut)")
+@pytest.mark.slow
 def test_the_whole_frames_give_what_independent_calculations_give(tmp_path):
     sidecar = (FRAMES / "raytwin.toml").read_text()
     walnut = '[[series]]\nname = "walnut"\nkind = "object"\nfiles = "scan_*.tif"\nsetting = "kv=40,power_w=12,exposure_ms=80"\n'

@@ -429,6 +429,7 @@ def test_finished_networks_are_not_trained_again_and_more_can_be_asked_for(datas
     assert epochs == [(0, False), (1, True)]
 
 
+@pytest.mark.slow
 def test_a_run_killed_between_two_states_ends_as_if_nothing_had_happened(dataset_file, tmp_path, monkeypatch):
     recipe = dataclasses.replace(QUICK, epochs=4)
 

@@ -150,7 +150,7 @@ def test_copper_alone_lets_the_tube_s_l_lines_through_where_a_sum_over_bins_is_o
     assert low < ours / truth - 1.0 < high
 
 
-@pytest.mark.parametrize("kV", [40.3, 70.2])
+@pytest.mark.parametrize("kV", [40.3, pytest.param(70.2, marks=pytest.mark.slow)])
 def test_the_spectrum_s_own_heights_give_signals_within_a_fifth_of_a_percent(kV: float) -> None:
     for filters in BEAMS:
         truth, gain = _spekpy_signal_and_gain(kV, filters)

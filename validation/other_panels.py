@@ -98,6 +98,12 @@ def shaded(light: np.ndarray, _: np.random.Generator) -> np.ndarray:
     return light * (1 - 0.3 * np.linspace(0, 1, SHAPE[0]) ** 3)[:, None]
 
 
+def bent(frames: np.ndarray, _: np.random.Generator) -> np.ndarray:
+    """A response that has lost 3 % at 60,000 DN."""
+    signal = frames - DARK_DN
+    return frames - 0.03 * signal * np.abs(signal) / 60000.0
+
+
 def in_patches(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Half of the electronic noise is common to patches of some 2 px."""
     smooth = gaussian_filter(rng.standard_normal(frames.shape), (0, 1, 1), mode="wrap")
@@ -116,6 +122,7 @@ CASES = {
     "means_of_4": Panel(averaged=4, read_DN=1.5),
     "dim": Panel(read_DN=12.0, currents_mA=(0.02, 0.05, 0.1, 0.2)),
     "dark_current": Panel(dark_DN_per_ms=0.1),
+    "bent": Panel(on_frames=bent),
     "few_electrons": Panel(electron_DN=2.3),  # two a photon at 80 kV
     "noise_in_patches": Panel(read_DN=12.0 / np.sqrt(2), on_frames=in_patches),
 }
@@ -183,10 +190,10 @@ def judged(name: str, seed: int, folder: Path) -> str:
     read = found["read_noise_DN"]
     text = f"worst gain {max(off, key=abs):+.1f} half widths of {100 * width:.1f} %; read noise {read['value']:.4g}"
     text += f" ({read['low']:.4g} to {read['high']:.4g}) of {truth:.4g} DN"
-    photons = rt.predict(twin, kV=80.0, filter="Al:2", current_mA=1.0, exposure_ms=EXPOSURE_ms).to_dict()[
-        "photons_absorbed"
-    ]
-    text += f"; {photons['value']:.0f} photons ({photons['low']:.0f} to {photons['high']:.0f}) of {beam(80.0)[0] * EXPOSURE_ms / 1000:.0f}"
+    load = {"current_mA": 1.0, "exposure_ms": EXPOSURE_ms}
+    photons = rt.predict(twin, kV=80.0, filter="Al:2", **load).to_dict()["photons_absorbed"]
+    text += f"; {photons['value']:.0f} photons ({photons['low']:.0f} to {photons['high']:.0f})"
+    text += f" of {beam(80.0)[0] * EXPOSURE_ms / 1000:.0f}"
     share = rt.validate(twin, path).to_dict()["coverage"]
     return f"{text}; held back inside: means {100 * share['mean']:.0f} %, noise {100 * share['sd']:.0f} % of {share['rows']}"
 

@@ -7,6 +7,8 @@ from typing import Any
 from ...errors import InputError
 from .twin import Twin
 
+USUAL_STRAY = 0.002  # relative, of a flat that is repeated
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredFlat:
@@ -39,6 +41,22 @@ def measured_flats(twin: Twin) -> tuple[MeasuredFlat, ...]:
             remedy="calibrate again",
         ) from None
     return tuple(flat for flat in found if flat.signal_DN > 0)
+
+
+def stray_of_flats(twin: Twin) -> float:
+    """Relative standard deviation by which one more flat of a measured beam strays from its level over the load.
+
+    As the calibrating flats show it (`scatter_of_flats` of the evidence), and no less than lines do usually: one session does not
+    show what another day brings.
+    """
+    found = twin.evidence.get("scatter_of_flats")
+    return max(USUAL_STRAY, float(found["relative_sd"])) if isinstance(found, Mapping) else USUAL_STRAY
+
+
+def stray_of_noise(twin: Twin) -> float:
+    """Relative standard deviation by which a series' noise power strays from what was fitted to all (`scatter_of_noise`)."""
+    found = twin.evidence.get("scatter_of_noise")
+    return float(found["relative_sd"]) if isinstance(found, Mapping) else 0.0
 
 
 def _flat(point: Mapping[str, Any]) -> MeasuredFlat:

@@ -15,7 +15,7 @@ from ...spectra import checked_kV
 from ..frames.present_line import PresentLine, present_line
 from ..line.binning import binned_pixel
 from ..line.line_limits import check_count_rate, check_limits
-from ..line.measured_flats import measured_flats
+from ..line.measured_flats import USUAL_STRAY, measured_flats, stray_of_flats, stray_of_noise
 from ..line.spectral_signal import OpenBeam
 from ..line.twin import Estimate, Level, SpectralPosterior, Twin, estimate_from_log_draws, estimate_from_sd
 from ..line.twin_spectrum import slope_over_gain, slope_share, spectral_model_of
@@ -42,7 +42,6 @@ UNITS = {
     "photons_absorbed": "photons a pixel and frame",
     "air_kerma_uGy": "uGy a frame",
 }
-_MEASURED_REPRODUCIBILITY = 0.002  # of a level measured at this kV and filter: what a repeat would show
 _FAR_ABOVE = 3.0  # times the brightest flat: beyond, nobody has seen whether the detector is linear
 _FAR_BELOW = 10.0  # below the dimmest flat over this, offsets matter that no flat has shown
 
@@ -404,7 +403,8 @@ def _by_model(
     outside = _outside(twin, setting, float(np.median(rate_draws)))
     # the draws hold what the parameters leave open; single levels stray from any such model, more so outside
     widen = math.sqrt(1.0 + len(outside))
-    level_sd = widen * posterior.level_discrepancy
+    beyond_repeats = math.sqrt(max(stray_of_flats(twin) ** 2 - USUAL_STRAY**2, 0.0))
+    level_sd = math.hypot(widen * posterior.level_discrepancy, beyond_repeats)
     gain_sd = widen * posterior.gain_discrepancy
     share, restored_sd = slope_share(twin), _restored_sd(twin)
     # level and gain are known together, not one by one: their product draw by draw
@@ -434,7 +434,7 @@ def _as_measured(
     """The flatfield with what was measured at this kV and filter in place of the model's; None: its load is not known."""
     if level.rate_DN_per_mAs is not None:
         rate = level.rate_DN_per_mAs
-        relative = math.hypot((rate.high - rate.low) / (2 * 1.959964) / rate.value, _MEASURED_REPRODUCIBILITY)
+        relative = math.hypot((rate.high - rate.low) / (2 * 1.959964) / rate.value, stray_of_flats(twin))
         value = rate.value * load_mAs * ((level.source_detector_mm or distance_mm) / distance_mm) ** 2
         mean_DN, gain_DN = estimate_from_sd(value, relative * value), level.gain_DN
         outside = _outside(twin, setting, mean_DN.value)
@@ -479,7 +479,8 @@ def _of_frames(twin: Twin, setting: Setting, flat: _Flat, warnings: list[str]) -
     of_reading = 2.0 * read.value * (read.high - read.low) / (2 * 1.959964) * binned.electronic
     # cut at 0, so that its upper end alone has the full width
     of_common = (common.high - common.value) / 1.959964 * mean_DN.value**2
-    relative_sd = 0.5 * math.hypot(of_quanta, of_reading, of_common) / variance
+    of_series = stray_of_noise(twin) * variance
+    relative_sd = 0.5 * math.hypot(of_quanta, of_reading, of_common, of_series) / variance
     saturated = saturation_text(twin, setting, mean_DN.value)
     if saturated:
         warnings.append(saturated)

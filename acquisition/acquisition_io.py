@@ -372,6 +372,34 @@ def _by(shape: Sequence[int] | None) -> str:
     return "?" if shape is None else " x ".join(str(length) for length in shape)
 
 
+_SERIES_WORDS = {
+    word.lower(): word
+    for word in (
+        *(
+            "kind",
+            "index",
+            "kV",
+            "current_mA",
+            "power_W",
+            "exposure_ms",
+            "filter",
+            "averaged",
+            "binning",
+            "source_detector_mm",
+        ),
+        *(
+            "source_object_mm",
+            "frame_interval_ms",
+            "belt_speed_mm_s",
+            "panel_rotation_deg",
+            "photons_per_pixel",
+            "scene",
+        ),
+        *("corrected", "role", "layer"),
+    )
+}
+
+
 def _series(group: Any, name: str, *, path: str) -> Series:
     where = f"{path}, series {name}"
     node = child(group, name)
@@ -390,6 +418,12 @@ def _series(group: Any, name: str, *, path: str) -> Series:
             f"{where}/frames", received=f"values of type {frames.dtype}", expected="uint16 or float32 detector numbers"
         )
     check_stored(frames, where=f"{where}/frames")
+    for word in node.attrs:
+        meant = _SERIES_WORDS.get(str(word).lower())
+        if meant not in (None, word):
+            raise FileFormatError(
+                f"{where}, attribute {word}", received=repr(word), expected=f"{meant}, written like that"
+            )
     kind = text_attribute(node, "kind", where=where)
     if kind not in KINDS:
         raise FileFormatError(
@@ -488,8 +522,12 @@ def _layers(node: Any, name: str, *, where: str) -> tuple[Filter, ...] | None:
     text = text_attribute(node, name, where=where)
     if text is None:
         return None
-    with named(where):
+    try:
         return filters_from_text(text)
+    except InputError as error:
+        raise FileFormatError(
+            f"{where}, {name}", received=error.received, expected=error.expected, remedy=error.remedy
+        ) from None
 
 
 def _times(node: Any, *, n_frames: int, where: str) -> NDArray[np.float64] | None:

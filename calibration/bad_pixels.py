@@ -28,8 +28,48 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
     """
     from scipy.ndimage import median_filter
 
+    code, closest = _bad_in_darks(darks)
+    brightest = max(flats, key=lambda pair: float(np.median(pair[1].mean_DN)))
+    signal = brightest[1].mean_DN - darks.of(brightest[0])
+    if not np.median(signal) > 0:
+        return _with_clusters(code, closest)  # no response to judge; the caller says so
+    local = median_filter(signal, size=5, mode="nearest")
+    ratio = signal / np.where(local > 0, local, np.nan)
+    code[(~np.isfinite(ratio) | (ratio < _DEAD)) & (code == 0)] = BAD_PIXEL_CODES["dead"]
+    centre, spread = _robust_spread(ratio[np.isfinite(ratio)])
+    departure = np.nan_to_num(np.abs(ratio - centre) / max(_DARK_NOISE_SIGMAS * spread, _LEAST_DEPARTURE))
+    np.maximum(closest, departure, out=closest)
+    code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["nonlinear"]
+    del local, ratio, departure  # as large as the panel
+    for item, total in flats:
+        if item is not brightest[0]:
+            _mark_changed(code, total.mean_DN - darks.of(item), signal)
+    return _with_clusters(code, closest)
+
+
+def unsteady_in_darks(darks: DarkFrames) -> NDArray[np.bool_]:
+    """Pixels (row, column) that the darks alone show as bad: hot ones and noisy ones."""
+    return np.asarray(_bad_in_darks(darks)[0] != 0)
+
+
+def is_noisy(variance_DN2: NDArray[np.float64], effective: float, step_DN2: float = 0.0) -> NDArray[np.bool_]:
+    """Where a variance from so many frames lies above that of all others by more than chance.
+
+    A variance from few frames has long tails (chi-square): cutting them off would lower the pooled variance.
+    """
+    from scipy.special import chdtri  # of chi-square's upper tail; scipy.stats would take 40 MB
+
+    centre = float(np.median(variance_DN2)) * effective / float(chdtri(effective, 0.5))
+    limit = centre * float(chdtri(effective, _NOISY_CHANCE)) / effective + step_DN2
+    return np.asarray(variance_DN2 > max(limit, 2.0 * centre))
+
+
+def _bad_in_darks(darks: DarkFrames) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Reason codes of hot and noisy pixels, and the largest departure of each pixel in limits (row, column)."""
+    from scipy.ndimage import median_filter
+
     code = np.zeros(darks.per_ms.shape, dtype=np.uint8)
-    closest = np.zeros(darks.per_ms.shape)  # largest departure, in limits
+    closest = np.zeros(darks.per_ms.shape)
     # noise far below the distance of the codes shows in pixels that lie between two of them alone: half of it in a mean
     steps = [(least_change(item.read_frames(0, min(item.n_frames, 2))), item.averaged) for item, _ in darks.sums]
     step_DN = max((step for step, _ in steps), default=1.0)
@@ -49,28 +89,8 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
         code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["hot"]
     variance, effective = (darks.variance, darks.effective) if darks.effective > 0 else darks.variance_between_series()
     if effective > 0 and np.all(np.isfinite(variance)):
-        # a variance from few frames has long tails (chi-square): cutting them off would lower the pooled variance
-        from scipy.special import chdtri  # of chi-square's upper tail; scipy.stats would take 40 MB
-
-        centre = float(np.median(variance)) * effective / float(chdtri(effective, 0.5))
-        limit = centre * float(chdtri(effective, _NOISY_CHANCE)) / effective + step_DN2
-        code[(variance > max(limit, 2.0 * centre)) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
-    brightest = max(flats, key=lambda pair: float(np.median(pair[1].mean_DN)))
-    signal = brightest[1].mean_DN - darks.of(brightest[0])
-    if not np.median(signal) > 0:
-        return _with_clusters(code, closest)  # no response to judge; the caller says so
-    local = median_filter(signal, size=5, mode="nearest")
-    ratio = signal / np.where(local > 0, local, np.nan)
-    code[(~np.isfinite(ratio) | (ratio < _DEAD)) & (code == 0)] = BAD_PIXEL_CODES["dead"]
-    centre, spread = _robust_spread(ratio[np.isfinite(ratio)])
-    departure = np.nan_to_num(np.abs(ratio - centre) / max(_DARK_NOISE_SIGMAS * spread, _LEAST_DEPARTURE))
-    np.maximum(closest, departure, out=closest)
-    code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["nonlinear"]
-    del local, ratio, departure  # as large as the panel
-    for item, total in flats:
-        if item is not brightest[0]:
-            _mark_changed(code, total.mean_DN - darks.of(item), signal)
-    return _with_clusters(code, closest)
+        code[is_noisy(variance, effective, step_DN2) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
+    return code, closest
 
 
 def _mark_changed(code: NDArray[np.uint8], other: NDArray[np.float64], signal: NDArray[np.float64]) -> None:

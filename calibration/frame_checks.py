@@ -176,6 +176,15 @@ def same_scene(pieces: Iterable[NDArray[Any]], *, offset_DN: float = 0.0, lit: b
     return scan.result(offset_DN=offset_DN, lit=lit)
 
 
+def with_median_at(frames: NDArray[Any], pixels: NDArray[np.bool_]) -> NDArray[Any]:
+    """The frames (m, row, column) with the median of each at these pixels (row, column)."""
+    if not pixels.any():
+        return frames
+    result = frames.copy()
+    result[:, pixels] = np.median(frames[:, ~pixels], axis=1, keepdims=True) if not pixels.all() else 0
+    return result
+
+
 class SceneScan:
     """`same_scene` for frames that are handed over one piece after the other."""
 

@@ -14,16 +14,25 @@ from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..errors import InputError
-from ..generator.line.twin import DetectorMaps, Estimate, Level, NoiseModel, SpreadEstimate, estimate_from_sd
+from ..generator.line.twin import (
+    BAD_PIXEL_CODES,
+    DetectorMaps,
+    Estimate,
+    Level,
+    NoiseModel,
+    SpreadEstimate,
+    estimate_from_sd,
+)
 from ._kept_sums import KeptSums, SumsKeeper
-from .bad_pixels import cluster_evidence, find_bad_pixels
+from .bad_pixels import cluster_evidence, find_bad_pixels, unsteady_in_darks
 from .common_noise import common_variance
 from .dark_frames import DarkFrames, dark_estimate, dark_map_sd, read_variance_map, sum_darks
 from .flat_evidence import flat_evidence, session_evidence
 from .flat_levels import SeriesPoint, gain_map_of, levels_of, series_points, with_noise_of_others
-from .frame_checks import repeated_frame_indices, same_scene
+from .frame_checks import repeated_frame_indices, same_scene, with_median_at
 from .frame_sums import PIECE_BYTES, sum_frames
 from .full_scale import full_scale_reached, reaches, top_of_range
+from .interpolated_pixels import find_interpolated
 from .noise_of_flats import FlatNoise, FlatPair, fit_flat_noise, pairs_of_singles
 from .noise_power import SMALLEST_SQUARE_PX
 from .repeated_frames import (
@@ -182,7 +191,8 @@ def _calibrating_series(acquisition: AcquisitionFile, tell: Progress) -> _Sessio
             of,
             received=f"frames of {rows} x {columns} pixels",
             expected=f"{SMALLEST_SQUARE_PX} x {SMALLEST_SQUARE_PX} pixels or more",
-            remedy="check that the files are no colour pictures and that rows and columns of raw files are as stated",
+            remedy="check that the files are no colour pictures and that rows and columns of raw files are as stated; lines of a line"
+            " camera make frames when a hundred or more are stacked",
         )
     tell("copies of frames")
     warnings: list[str] = []
@@ -238,11 +248,15 @@ class _Flats:
         return found
 
 
-def _scene_change(item: Series, offset_DN: float) -> str:
-    """What differs between the frames of a series beyond noise, drift and flicker; empty: nothing that can be seen."""
+def _scene_change(item: Series, darks: DarkFrames, unsteady: NDArray[np.bool_]) -> str:
+    """What differs between the frames of a series beyond noise, drift and flicker; empty: nothing that can be seen.
+
+    unsteady (row, column): pixels whose noise is no sign of another scene.
+    """
     if item.n_frames < 2:
         return ""
-    found = same_scene(item.iter_frames(maximum_bytes=PIECE_BYTES), offset_DN=offset_DN)
+    pieces = (with_median_at(piece, unsteady) for piece in item.iter_frames(maximum_bytes=PIECE_BYTES))
+    found = same_scene(pieces, offset_DN=float(np.median(darks.of(item))))
     if found.same is not False or found.change is None:
         return ""
     return f"its frames do not show one scene: {found.change.value} changes from frame {found.frame}"
@@ -257,6 +271,7 @@ def _sum_flats(session: _Session, darks: DarkFrames, sums_of: SumsOf, *, repeate
     bits = session.acquisition.instrument.bits
     sums: list[tuple[Series, KeptSums, str]] = []
     saturation_DN: dict[str, float] = {}
+    unsteady = unsteady_in_darks(darks)
     for item in session.flats:
         total = sums_of(item)
         full, top = full_scale_reached(total, bits), top_of_range(total, bits)
@@ -270,7 +285,7 @@ def _sum_flats(session: _Session, darks: DarkFrames, sums_of: SumsOf, *, repeate
             saturation_DN[item.name] = top
             reason = f"within 4 standard deviations of the full scale of {top:g} DN"
         else:
-            reason = _scene_change(item, float(np.median(darks.of(item))))
+            reason = _scene_change(item, darks, unsteady)
         sums.append((item, total, reason))
     # beams of single frames alone: their noise is looked for in what was repeated at the same beam
     single = {beam_of(item) for item, _, reason in sums if reason == _SINGLE}
@@ -284,7 +299,7 @@ def _sum_flats(session: _Session, darks: DarkFrames, sums_of: SumsOf, *, repeate
     noted: list[str] = []
     noise_series = []
     for item in series_of_beams(repeated, sorted(single, key=str), session.shape):
-        change = _scene_change(item, float(np.median(darks.of(item))))
+        change = _scene_change(item, darks, unsteady)
         if change:
             noted.append(f"{item.name} is not used for noise: {change}; declare each scene as a series of its own")
         else:
@@ -295,6 +310,7 @@ def _sum_flats(session: _Session, darks: DarkFrames, sums_of: SumsOf, *, repeate
     if all(reason for *_, reason in sums) and not noise_series and not pairs:
         raise _no_usable_flat(session.acquisition, sums)
     bad = find_bad_pixels(darks, judged if noise_series or pairs else [pair for pair in judged if pair[1].pairs > 0])
+    noted += _mark_interpolated(bad, [*(item for item, _ in judged), *session.darks])
     good = bad == 0
 
     def usable(total: KeptSums, mask: NDArray[np.bool_]) -> bool:
@@ -320,6 +336,23 @@ def _sum_flats(session: _Session, darks: DarkFrames, sums_of: SumsOf, *, repeate
     if all(reason for *_, reason in sums):
         raise _no_usable_flat(session.acquisition, sums)
     return _Flats(sums=sums, pairs=pairs, others=others, bad=bad, saturation_DN=saturation_DN, noted=noted)
+
+
+def _mark_interpolated(bad: NDArray[np.uint8], series: Sequence[Series]) -> list[str]:
+    """Mark pixels (row, column) that hold means of their neighbours, and say what is to be said of them."""
+    found = find_interpolated(series)
+    if found is None:
+        declared = [item.name for item in series if "defects" in item.corrected]
+        if not declared:
+            return []
+        return [
+            f"{declared[0]}: pixels are replaced (corrected = defects), and so few frames do not tell which: the noise of means is in"
+            " gain and spread"
+        ]
+    new = found & (bad == 0)
+    bad[new] = BAD_PIXEL_CODES["interpolated"]
+    share = 100.0 * float(new.mean())
+    return [f"{share:.2g} % of the pixels hold means of their neighbours and are left out"] if share > 0 else []
 
 
 def _no_usable_flat(acquisition: AcquisitionFile, sums: Sequence[tuple[Series, KeptSums, str]]) -> InputError:

@@ -1080,10 +1080,15 @@ def _sd_of_gain_over_slope(covariance: FloatArray) -> float:
 
 
 def _spread_variances(item: _Candidate, inflation: float) -> dict[str, float]:
-    """Sampling variances of the spread's parameters; those that the family does not have are 0."""
+    """Sampling variances of the spread's parameters, at most those of any value between their bounds; those that the family does
+    not have are 0."""
     linear = len(item.coefficients)
     own = {
-        name: max(inflation * float(item.covariance[linear + i, linear + i]), 0.0) for i, name in enumerate(item.names)
+        name: min(
+            max(inflation * float(item.covariance[linear + i, linear + i]), 0.0),
+            (_BOUNDS[name][1] - _BOUNDS[name][0]) ** 2 / 12.0,
+        )
+        for i, name in enumerate(item.names)
     }
     # the width at one standard deviation of its square: right also where the width is near 0
     sigma_px = item.spread.sigma_px

@@ -24,6 +24,7 @@ UNFIT = NO_PATTERN | {
     FindingCode.COMPRESSED,
     FindingCode.SAME_AS,
     FindingCode.SHAPES,
+    FindingCode.SMALL,
 }
 _LABELS = frozenset({FindingCode.LOAD_LABEL, FindingCode.LABEL})
 
@@ -73,14 +74,15 @@ def _serves(item: Series, codes: set[FindingCode]) -> tuple[str, ...]:
         return ()
     serves = []
     repeats = item.n_frames > 1 and FindingCode.SCENE_CHANGES not in codes
-    if item.kind == "dark" and "offset" not in item.corrected:
-        serves.append(DARK_LEVEL)
+    if item.kind == "dark":
+        if "offset" not in item.corrected:
+            serves.append(DARK_LEVEL)
         if repeats and FindingCode.CLIPPED not in codes:
             serves.append(READ_NOISE)
     elif item.kind == "flat":
-        if "log" not in item.corrected and FindingCode.SCENE_CHANGES not in codes:
+        if not item.corrected & {"gain", "log"} and FindingCode.SCENE_CHANGES not in codes:
             serves.append(LEVEL)
-            if repeats and "gain" not in item.corrected:
+            if repeats:
                 serves.append(NOISE)
             loaded = item.current_mA is not None or item.power_W is not None
             if item.kV is not None and loaded and item.exposure_ms and not codes & _LABELS:

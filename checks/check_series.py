@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.series_roles import calibrating_names
+from ..calibration.bad_pixels import is_noisy
 from ..calibration.code_steps import code_step
 from ..calibration.frame_checks import LEVEL_CHANGE, SceneChange
+from ..calibration.noise_power import SMALLEST_SQUARE_PX
 from ..errors import FileFormatError, InputError
 from . import frame_signs
 from .allowances import NO_PATTERN, UNFIT, allowed_by, next_measurements, series_row
 from .check_result import CheckResult
+from .declared import unknown_words
 from .findings import Finding, FindingCode, Severity
 from .labels import check_labels
 from .loads_and_clocks import clock_findings, load_findings
@@ -32,6 +35,7 @@ _HOW = {
 }
 _LIT = ("flat", "object")
 _PATTERN_BYTES = 2**28
+_DARK_FRAMES = 8  # that tell which pixels are far noisier than others
 
 Progress = Callable[[str], None]
 
@@ -55,18 +59,19 @@ def check_series(acquisition: AcquisitionFile, *, progress: Progress | None = No
     scans: dict[str, _Kept] = {}
     patterns: dict[str, list[_Pattern]] = {}
     digests: dict[bytes, str] = {}
-    dark_DN = _dark_level(acquisition)
+    dark_DN, unlit = _without_light(acquisition)
     for item in acquisition.series:
         if progress is not None:
             progress(item.name)
         try:
-            scan = scan_series(item)
+            dark = unlit.get(item.shape)
+            scan = scan_series(item, unsteady=None if dark is None else dark.unsteady)
         except FileFormatError as error:
             # the series is named beside the sentence
             what = one_line(error, Path(acquisition.path), acquisition.path).removeprefix(f"series {item.name}/")
             findings.append(Finding(code=FindingCode.DAMAGED, series=item.name, values={"what": what}))
             continue
-        found = _series_findings(scan, acquisition, dark_DN)
+        found = _series_findings(scan, acquisition, dark_DN, dark)
         found += _copies_of_others(scan, digests)
         if not any(entry.code in NO_PATTERN for entry in found):
             _keep_pattern(scan, dark_DN, patterns)
@@ -112,19 +117,36 @@ class _Kept:
     codes: set[FindingCode]
 
 
-def _dark_level(acquisition: AcquisitionFile) -> float:
-    """Level without light (DN), from the first frames of the darks; 0 where there are none."""
-    levels = []
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Unlit:
+    """What darks of one shape show: first_DN (row, column), a frame; unsteady (row, column): pixels of far more noise than others."""
+
+    first_DN: NDArray[Any]
+    unsteady: NDArray[np.bool_]
+
+
+def _without_light(acquisition: AcquisitionFile) -> tuple[float, dict[tuple[int, int], _Unlit]]:
+    """Level without light (DN; 0 where there are no darks), and what the first raw dark of each shape shows."""
+    levels: list[float] = []
+    shown: dict[tuple[int, int], _Unlit] = {}
     for item in acquisition.of_kind("dark"):
         try:
-            levels.append(float(np.median(item.read_frames(0, 1))))
+            frames = item.read_frames(0, 1 if item.shape in shown else min(item.n_frames, _DARK_FRAMES))
         except FileFormatError:
             continue
-    return min(levels) if levels else 0.0
+        levels.append(float(np.median(frames[0])))
+        if not item.corrected and item.shape not in shown:
+            unsteady = np.zeros(item.shape, dtype=bool)
+            if len(frames) > 2:
+                unsteady = is_noisy(frames.var(axis=0, ddof=1, dtype=np.float64), len(frames) - 1.0)
+            shown[item.shape] = _Unlit(first_DN=frames[0], unsteady=unsteady)
+    return min(levels, default=0.0), shown
 
 
-def _series_findings(scan: SeriesScan, acquisition: AcquisitionFile, dark_DN: float) -> list[Finding]:
-    """What the frames of one series show by themselves."""
+def _series_findings(
+    scan: SeriesScan, acquisition: AcquisitionFile, dark_DN: float, unlit: _Unlit | None
+) -> list[Finding]:
+    """What the frames of one series show by themselves; unlit: what darks of its shape do."""
     item = scan.series
     name = item.name
     counting = bool(acquisition.instrument.counting)
@@ -146,16 +168,19 @@ def _series_findings(scan: SeriesScan, acquisition: AcquisitionFile, dark_DN: fl
     if lit and scan.values.dtype.kind == "f" and high <= 20.0 and not item.corrected & {"gain", "log"} and not counting:
         add(FindingCode.LOGARITHMS, low=low, high=high)
         return found
+    if min(item.shape) < SMALLEST_SQUARE_PX:
+        add(FindingCode.SMALL, shape=" x ".join(map(str, item.shape)))
     copies = scan.copies.copies()
     if copies:
         first = min(copies)
         add(FindingCode.COPIES, count=len(copies), frames=item.n_frames, first=first, origin=copies[first])
-    top = frame_signs.pile_up_at_top(scan.values)
+    lifted = _lifted_by_light(scan.values, None if unlit is None else unlit.first_DN)
+    top = frame_signs.pile_up_at_top(lifted)
     bits = acquisition.instrument.bits
     if top is not None and lit and not counting:
         add(FindingCode.SATURATED, percent=100.0 * top[1], top=top[0])
-    elif bits and lit and high >= 2**bits - 1 and float(np.mean(scan.values >= 2**bits - 1)) > 1e-3:
-        add(FindingCode.SATURATED, percent=100.0 * float(np.mean(scan.values >= 2**bits - 1)), top=2.0**bits - 1)
+    elif bits and lit and float(np.mean(lifted >= 2**bits - 1)) > 1e-3:
+        add(FindingCode.SATURATED, percent=100.0 * float(np.mean(lifted >= 2**bits - 1)), top=2.0**bits - 1)
     zeros = None if counting or item.corrected & {"log", "gain"} else frame_signs.share_at_zero(scan.values)
     if zeros is not None:
         add(FindingCode.CLIPPED, percent=100.0 * zeros)
@@ -189,6 +214,15 @@ def _series_findings(scan: SeriesScan, acquisition: AcquisitionFile, dark_DN: fl
         if uneven < _EVEN:
             add(FindingCode.FLAT_CORRECTED, percent=100.0 * uneven)
     return found
+
+
+def _lifted_by_light(values: NDArray[Any], unlit: NDArray[Any] | None) -> NDArray[Any]:
+    """Values (frame, pixel) of the pixels that do not stand at the highest value without light too: those are stuck."""
+    flat = values.reshape(len(values), -1)
+    if unlit is None:
+        return flat
+    free = unlit.ravel() < flat.max(initial=0)
+    return flat[:, free] if free.any() else flat
 
 
 def _level_jump(scan: SeriesScan, offset_DN: float) -> tuple[int, float] | None:
@@ -297,8 +331,12 @@ def _session_findings(
     found: list[Finding] = []
     kinds = {item.kind for item in acquisition.series}
     corrected = [item for item in acquisition.of_kind("flat") if "offset" in item.corrected]
+    unknown, nameless = unknown_words(acquisition)
+    found += unknown
     if "flat" not in kinds:
         found.append(Finding(code=FindingCode.NO_FLAT))
+    elif all(item.corrected & {"gain", "log"} for item in acquisition.of_kind("flat")):
+        found.append(Finding(code=FindingCode.CORRECTED_FLATS))
     elif "dark" not in kinds and not acquisition.instrument.counting and not corrected:
         found.append(Finding(code=FindingCode.NO_DARK))
     imaged = [item for item in read if item.kind in ("dark", "flat")]
@@ -318,7 +356,12 @@ def _session_findings(
             )
     levels = {name: kept.level_DN for name, kept in scans.items()}
     labels = _label_findings(
-        acquisition, [item for item in read if not scans[item.name].codes & (UNFIT | {FindingCode.AVERAGED})]
+        acquisition,
+        [
+            item
+            for item in read
+            if item.name not in nameless and not scans[item.name].codes & (UNFIT | {FindingCode.AVERAGED})
+        ],
     )
     found += labels
     unfit = {name for entry in found for name in entry.names}

@@ -20,9 +20,12 @@ class FindingCode(enum.StrEnum):
     """What was found; the value is what the JSON answer says."""
 
     DAMAGED = "damaged"
+    UNKNOWN = "unknown_word"
+    CORRECTED_FLATS = "corrected_flats"
     NO_DARK = "no_dark"
     NO_FLAT = "no_flat"
     SHAPES = "shapes_differ"
+    SMALL = "frames_too_small"
     MISSING = "missing_information"
     SINGLE_FRAME = "single_frame"
     SCENE_CHANGES = "scene_changes"
@@ -65,6 +68,12 @@ class _Entry:
 
 _ENTRIES: dict[FindingCode, _Entry] = {
     FindingCode.DAMAGED: _Entry(Severity.ERROR, "{what}"),
+    FindingCode.UNKNOWN: _Entry(Severity.ERROR, "{what}"),
+    FindingCode.CORRECTED_FLATS: _Entry(
+        Severity.ERROR,
+        "all flats are divided by a gain map or are logarithms, so they hold neither level nor noise: export them raw, or with"
+        " the offset alone taken off",
+    ),
     FindingCode.NO_DARK: _Entry(
         Severity.ERROR,
         "no dark series and frames that are not offset-corrected: measure darks (beam off, same exposure), or declare"
@@ -75,6 +84,10 @@ _ENTRIES: dict[FindingCode, _Entry] = {
     ),
     FindingCode.SHAPES: _Entry(
         Severity.ERROR, "{shape} pixels, where {other} has {other_shape}: darks and flats need one shape"
+    ),
+    FindingCode.SMALL: _Entry(
+        Severity.ERROR,
+        "frames of {shape} pixels, where gain and spread need 8 x 8 or more: stack lines of a line camera, a hundred or more a frame",
     ),
     FindingCode.MISSING: _Entry(Severity.NOTE, "{what}"),
     FindingCode.SINGLE_FRAME: _Entry(

@@ -92,6 +92,8 @@ def block_grid(differences: NDArray[np.float64]) -> bool:
     Args:
         differences: of successive frames (n, row, column), DN.
     """
+    if min(differences.shape[1:]) <= 4 * _GRID:
+        return False
     return all(_steps_at_grid(np.diff(differences, axis=axis), axis) for axis in (1, 2))
 
 
@@ -99,8 +101,6 @@ def _steps_at_grid(steps: NDArray[np.float64], axis: int) -> bool:
     squares = np.minimum(steps**2, 25.0 * max(float(np.median(steps**2)), 1e-12))
     other = (0, 3 - axis)
     along = squares.mean(axis=other)
-    if along.size < 4 * _GRID:
-        return False
     phases = np.array([float(np.mean(along[phase::_GRID])) for phase in range(_GRID)])
     # sampling error of a phase from the spread of its members, whatever correlates the noise
     errors = np.array(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import PIECE_BYTES, Series
-from ..calibration.frame_checks import CopyScan, SceneScan
+from ..calibration.frame_checks import CopyScan, SceneScan, with_median_at
 
 _SAMPLE_FRAMES = 4  # whose values are kept whole, spread over the first piece
 _SAMPLE_VALUES = 4_000_000
@@ -42,11 +42,14 @@ class SeriesScan:
         return bool(self.values.size and (self.values == self.values.flat[0]).all() and np.ptp(self.frame_mean_DN) == 0)
 
 
-def scan_series(series: Series, *, progress: Callable[[int], None] | None = None) -> SeriesScan:
+def scan_series(
+    series: Series, *, unsteady: NDArray[np.bool_] | None = None, progress: Callable[[int], None] | None = None
+) -> SeriesScan:
     """Read a series once.
 
     Args:
         series: of an open acquisition.
+        unsteady: pixels (row, column) whose noise is no sign of another scene.
         progress: called with the number of frames read so far.
 
     Raises:
@@ -65,7 +68,7 @@ def scan_series(series: Series, *, progress: Callable[[int], None] | None = None
     most = max(1, min(_SAMPLE_FRAMES, _SAMPLE_VALUES // pixels))
     for piece in series.iter_frames(maximum_bytes=PIECE_BYTES):
         copies.add(piece)
-        scene.add(piece)
+        scene.add(piece if unsteady is None else with_median_at(piece, unsteady))
         total += piece.sum(axis=0, dtype=np.float64)
         means += piece.mean(axis=(1, 2), dtype=np.float64).tolist()
         for frame in piece:

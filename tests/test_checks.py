@@ -5,13 +5,16 @@ import math
 import re
 import sys
 import tomllib
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import tifffile
 
+from raytwin import calibrate
 from raytwin.acquisition import open_acquisition
 from raytwin.checks import frame_signs
 from raytwin.checks.check import check_acquisition
@@ -66,6 +69,83 @@ def test_a_good_session_is_not_suspected_and_its_series_serve(session):
     assert {"spectrum: other kV and filters", "output of the tube, dose"} <= possible
     assert "lag" not in possible
     assert len(repr(result).splitlines()) <= 20
+
+
+def test_stuck_and_wildly_noisy_pixels_make_no_flat_saturated_and_no_scene_change(broken, tmp_path):
+    """Both show in the darks, and no panel is without them; a flat that saturates is told all the same."""
+    rng = np.random.default_rng(8)
+    stuck, noisy = np.zeros((2, *broken.SHAPE), dtype=bool)
+    stuck.flat[rng.choice(stuck.size, 12, replace=False)] = True
+    noisy.flat[rng.choice(stuck.size, 8, replace=False)] = True
+    series = []
+    for one in broken.good_session(broken.panel_of(7)):
+        frames = one.frames + np.where(noisy, 900.0 * rng.standard_normal(one.frames.shape), 0.0)
+        if one.name == broken.BRIGHT:
+            frames[:, 40:60, 40:60] = broken.FULL_DN
+        frames = np.where(stuck, broken.FULL_DN, np.clip(np.rint(frames), 0, broken.FULL_DN))
+        series.append(replace(one, frames=frames.astype(np.uint16)))
+    path = tmp_path / "session.h5"
+    broken.write(path, series)
+    found = [(finding.code, finding.series) for finding in check_acquisition(path).findings]
+    assert found == [(FindingCode.SATURATED, broken.BRIGHT)]
+    # calibration leaves out the one that saturates and takes the others for what they are
+    twin = calibrate(path)
+    assert [line for line in twin.warnings if "left out" in line] == [
+        f"left out of the fit: {broken.BRIGHT} (saturated at {broken.FULL_DN} DN)"
+    ]
+    assert all(level.gain_DN.low < broken.GAIN_DN < level.gain_DN.high for level in twin.levels)
+
+
+@pytest.mark.parametrize(
+    ("changed", "series", "text"),
+    [
+        ({"filter": "steel:0.5"}, True, r"filter: got steel:0\.5; expected .* nearest: steel_304"),
+        ({"kV": 40000.0}, True, r"kV: got 40000 kV; expected 10 to 300 kV"),
+        ({"anode": "tungsten"}, False, r"anode: got 'tungsten'; expected one of W, Mo"),
+        ({"scintillator": "Csi:0.5+glue:1"}, False, r"scintillator: got .*glue:1.*"),
+    ],
+)
+def test_words_that_nobody_knows_are_told_as_they_were_written(broken, session, tmp_path, changed, series, text):
+    path = tmp_path / "session.h5"
+    path.write_bytes(session.read_bytes())
+    with h5py.File(path, "r+") as file:
+        (file[f"series/{broken.VICTIM}"] if series else file["instrument"]).attrs.update(changed)
+    (found,) = (item for item in check_acquisition(path).findings if item.severity == "error")
+    assert found.code == FindingCode.UNKNOWN and found.series == (broken.VICTIM if series else "")
+    assert re.search(text, found.text)
+
+
+def test_a_label_whose_case_is_wrong_is_no_missing_label(broken, session, tmp_path):
+    path = tmp_path / "session.h5"
+    path.write_bytes(session.read_bytes())
+    with h5py.File(path, "r+") as file:
+        labels = file[f"series/{broken.VICTIM}"].attrs
+        labels["kv"] = labels["kV"]
+        del labels["kV"]
+    with pytest.raises(InputError, match=r"attribute kv: got 'kv'; expected kV, written like that"):
+        open_acquisition(path)
+
+
+def test_flats_that_calibrate_nothing_are_told(broken, session, tmp_path):
+    path = tmp_path / "session.h5"
+    path.write_bytes(session.read_bytes())
+    with h5py.File(path, "r+") as file:
+        for item in file["series"].values():
+            if item.attrs["kind"] == "flat":
+                item.attrs["corrected"] = "offset+gain"
+    result = check_acquisition(path)
+    assert FindingCode.CORRECTED_FLATS in {item.code for item in result.findings}
+    assert not any(item.possible for item in result.allows if item.what.startswith(("gain", "spectrum", "linearity")))
+
+
+def test_lines_of_a_line_camera_are_told_to_be_stacked(broken, tmp_path):
+    path = tmp_path / "session.h5"
+    lines = [replace(one, frames=one.frames[:, :1]) for one in broken.good_session(broken.panel_of(7))]
+    broken.write(path, lines)
+    result = check_acquisition(path)
+    small = [item for item in result.findings if item.code == FindingCode.SMALL]
+    assert len(small) == len(lines) and "stack lines" in small[0].text
+    assert not any(row.serves_for for row in result.series)
 
 
 def test_the_json_answer_holds_what_scripts_read(session, capsys):

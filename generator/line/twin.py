@@ -28,7 +28,16 @@ BAD_PIXEL_MAP = "bad_pixels"
 Z95 = 1.959964  # standard deviations of a Gaussian on either side that hold 95 %
 LEAST_PIXELS = 16  # that are not bad: with fewer, medians and spreads over a frame say nothing
 # reason codes of bad pixels; a pixel carries the first that applies
-BAD_PIXEL_CODES = {"good": 0, "dead": 1, "hot": 2, "noisy": 3, "nonlinear": 4, "declared": 5, "clustered": 6}
+BAD_PIXEL_CODES = {
+    "good": 0,
+    "dead": 1,
+    "hot": 2,
+    "noisy": 3,
+    "nonlinear": 4,
+    "declared": 5,
+    "clustered": 6,
+    "interpolated": 7,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -48,9 +48,10 @@ _FAR_BELOW = 10.0  # below the dimmest flat over this, offsets matter that no fl
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
 class Prediction(Result):
-    """A flatfield, detector median, of the mean of `setting.averaged` frames.
+    """A flatfield of the mean of `setting.averaged` frames, at the pixel of the median level.
 
-    Fields: mean_DN (above dark), sd_DN (temporal, one pixel), gain_DN (single frame), photons_absorbed (a pixel and
+    Fields: mean_DN (above dark; the median over good pixels, which a field that falls off to its borders has above its mean),
+    sd_DN (temporal, one pixel), gain_DN (single frame), photons_absorbed (a pixel and
     frame), air_kerma_uGy (a frame, at the object or, where its distance is unknown, at the detector); intervals are of
     the quantity itself, without the sampling noise of a later measurement. None where the twin cannot say;
     extrapolated: outside the calibrated range; warnings say why and what else to know; frames_per_s (averaging done) and

@@ -1,0 +1,99 @@
+"""Pixels that firmware has replaced by means of their neighbours: they hold less noise, and share it with these."""
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+from ..acquisition.acquisition_io import PIECE_BYTES, Series
+
+# Neighbours (row, column) that a pixel is the mean of: one of the next four or all of them, pairs across it, all eight
+_NEAR = ((0, -1), (0, 1), (-1, 0), (1, 0))
+_FAR = ((-1, -1), (1, 1), (-1, 1), (1, -1))
+_SOURCES = (
+    *((place,) for place in _NEAR),
+    *((first, (-first[0], -first[1])) for first in ((0, 1), (1, 0), (1, 1), (1, -1))),
+    _NEAR,
+    (*_NEAR, *_FAR),
+)
+_DIFFERENCES = 64  # of frames, over all series: more tell no more
+_LEAST_DIFFERENCES = 8  # fewer do not tell a pixel without noise of its own from chance
+_CHANCE = 1e-9  # that a pixel with noise of its own looks like one without
+_MOST_LEFT = 0.1  # of the others' noise, by rounding; a pixel that one mean of two was made of has a quarter
+_BLOCK_PX = 32  # noise hardly changes over so many pixels
+
+
+def find_interpolated(series: Sequence[Series]) -> NDArray[np.bool_] | None:
+    """Pixels (row, column) that follow neighbours from frame to frame with no noise of their own.
+
+    What a pixel differs by from the mean of neighbours has the variance of white noise and more, or less where light spreads; of
+    a replaced pixel nothing is left but rounding. It is compared with the same of other pixels nearby, as it is and over the
+    pixel's own variance, so that neither shade nor blur looks like it.
+
+    Args:
+        series: flats and darks of one shape, as read.
+
+    Returns:
+        None: too few frames to tell.
+    """
+    usable = [item for item in series if item.n_frames > 1]
+    most = -(-_DIFFERENCES // max(len(usable), 1))
+    shape = usable[0].shape if usable else (0, 0)
+    own, left = np.zeros(shape, dtype=np.float32), np.zeros((len(_SOURCES), *shape), dtype=np.float32)
+    count = 0
+    for item in usable:
+        own_here, left_here = np.zeros_like(own), np.zeros_like(left)
+        found = 0
+        for change in _changes(item, most):
+            own_here += change**2
+            padded = np.pad(change, 1, mode="reflect")
+            rows, columns = shape
+            for number, places in enumerate(_SOURCES):
+                mean = sum(
+                    padded[1 + row : 1 + row + rows, 1 + column : 1 + column + columns] for row, column in places
+                )
+                left_here[number] += (change - mean / len(places)) ** 2
+            found += 1
+        typical = float(np.median(own_here))
+        if found and typical > 0:
+            # each difference counts alike, bright or dark
+            own += own_here * (found / typical)
+            left += left_here * (found / typical)
+            count += found
+    if count < _LEAST_DIFFERENCES:
+        return None
+    # over the median of chi-square of so many degrees
+    least = min(_MOST_LEFT, float(gammaincinv(0.5 * count, _CHANCE) / gammaincinv(0.5 * count, 0.5)))
+    result = np.zeros(shape, dtype=bool)
+    for squares in left:
+        share = squares / np.maximum(own, np.finfo(np.float32).tiny)
+        result |= (squares < least * _nearby(squares)) & (share < least * _nearby(share))
+    return result
+
+
+def _changes(item: Series, most: int) -> Iterator[NDArray[np.float32]]:
+    """Differences (row, column) of pairs of frames that share none, without their mean, DN."""
+    first: NDArray[np.float64] | None = None
+    for piece in item.iter_frames(maximum_bytes=PIECE_BYTES):
+        for frame in piece:
+            if most < 1:
+                return
+            if first is None:
+                first = frame.astype(np.float64)
+                continue
+            change = frame - first
+            yield (change - np.median(change)).astype(np.float32)
+            first, most = None, most - 1
+
+
+def _nearby(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Median of the block that each pixel lies in (row, column)."""
+    rows, columns = (max(1, math.ceil(side / _BLOCK_PX)) for side in values.shape)
+    result = np.empty_like(values)
+    for down in np.array_split(np.arange(values.shape[0]), rows):
+        for across in np.array_split(np.arange(values.shape[1]), columns):
+            part = np.s_[down[0] : down[-1] + 1, across[0] : across[-1] + 1]
+            result[part] = np.median(values[part])
+    return result

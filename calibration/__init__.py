@@ -6,6 +6,7 @@ Files:
     frame_sums            sums over the frames of a series, in one pass
     dark_frames           dark level, growth with exposure, read noise
     bad_pixels            pixels that are bad, and why
+    interpolated_pixels   pixels that hold means of their neighbours
     full_scale            series that reach the end of the ADC's range
     flat_levels           each series as photon transfer sees it, the level of each beam, the gain map
     flat_evidence         drift, lag, linearity, repeats, shape of the noise

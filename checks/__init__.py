@@ -8,6 +8,7 @@ Files:
     allowances          what series serve for, what can be learnt, what to measure next
     series_scan         what is asked of one series' frames, in one pass
     frame_signs         signs of processing
+    declared            anodes, voltages and materials that nobody knows
     loads_and_clocks    levels against tube loads, times against frames
     labels              labels that the frames contradict, top to bottom
     readings            label, mean frame and noise of each series

@@ -48,6 +48,7 @@ from .repeated_frames import (
 from .spread_fit import SpreadFit
 
 ESTIMATORS = ("pairs", "stack")
+_ONE_BEAM = 1.32  # largest over smallest signal a load: 15 % to either side, as `raytwin check` allows
 _SINGLE = "a single frame has no noise"
 _UNSTEADY_PERCENT = 0.3  # rms of the tube's output from frame to frame that is worth a warning
 
@@ -287,6 +288,9 @@ def _sum_flats(session: _Session, darks: DarkFrames, sums_of: SumsOf, *, repeate
         else:
             reason = _scene_change(item, darks, unsteady)
         sums.append((item, total, reason))
+    _check_one_beam(
+        [(item, float(np.median(total.mean_DN - darks.of(item)))) for item, total, reason in sums if not reason]
+    )
     # beams of single frames alone: their noise is looked for in what was repeated at the same beam
     single = {beam_of(item) for item, _, reason in sums if reason == _SINGLE}
     single -= {beam_of(item) for item, _, reason in sums if not reason}
@@ -336,6 +340,30 @@ def _sum_flats(session: _Session, darks: DarkFrames, sums_of: SumsOf, *, repeate
     if all(reason for *_, reason in sums):
         raise _no_usable_flat(session.acquisition, sums)
     return _Flats(sums=sums, pairs=pairs, others=others, bad=bad, saturation_DN=saturation_DN, noted=noted)
+
+
+def _check_one_beam(levels: Sequence[tuple[Series, float]]) -> None:
+    """Flats without kV count as one beam.
+
+    Args:
+        levels: flats with their signal, DN.
+
+    Raises:
+        InputError: signals over current and exposure that one beam does not have.
+    """
+    groups: dict[tuple[Any, ...], list[float]] = {}
+    for item, signal_DN in levels:
+        if item.kV is None and item.current_mA and item.exposure_ms and signal_DN > 0:
+            group = (item.session, item.filters, item.source_detector_mm)
+            groups.setdefault(group, []).append(signal_DN / (item.current_mA * item.exposure_ms))
+    for rates in groups.values():
+        if max(rates) > _ONE_BEAM * min(rates):
+            raise InputError(
+                "flats without kV",
+                received=f"{1000 * min(rates):.0f} to {1000 * max(rates):.0f} DN a mAs",
+                expected="one beam, whose signal is proportional to current and exposure",
+                remedy="state the kV of every flat: those of several voltages have gains of their own",
+            )
 
 
 def _mark_interpolated(bad: NDArray[np.uint8], series: Sequence[Series]) -> list[str]:

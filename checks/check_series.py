@@ -333,6 +333,12 @@ def _session_findings(
     corrected = [item for item in acquisition.of_kind("flat") if "offset" in item.corrected]
     unknown, nameless = unknown_words(acquisition)
     found += unknown
+    without_kV = [
+        item for item in read if item.kind == "flat" and item.kV is None and (item.current_mA or item.power_W)
+    ]
+    if without_kV:
+        found.append(Finding(code=FindingCode.NO_KV, values={"count": len(without_kV)}))
+        nameless |= {item.name for item in without_kV}
     if "flat" not in kinds:
         found.append(Finding(code=FindingCode.NO_FLAT))
     elif all(item.corrected & {"gain", "log"} for item in acquisition.of_kind("flat")):
@@ -377,7 +383,7 @@ def _session_findings(
         and not scans[item.name].codes & UNFIT
     ]
     signals = _signals([item for item in read if item.name not in unfit], flats, levels, dark_DN)
-    found += load_findings(flats, signals)
+    found += load_findings([item for item in flats if item.name not in nameless], signals)
     found += clock_findings(read)
     found += [
         Finding(code=FindingCode.SINGLE_FRAME, series=item.name)

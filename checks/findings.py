@@ -26,6 +26,7 @@ class FindingCode(enum.StrEnum):
     NO_FLAT = "no_flat"
     SHAPES = "shapes_differ"
     SMALL = "frames_too_small"
+    NO_KV = "no_kV"
     MISSING = "missing_information"
     SINGLE_FRAME = "single_frame"
     SCENE_CHANGES = "scene_changes"
@@ -88,6 +89,11 @@ _ENTRIES: dict[FindingCode, _Entry] = {
     FindingCode.SMALL: _Entry(
         Severity.ERROR,
         "frames of {shape} pixels, where gain and spread need 8 x 8 or more: stack lines of a line camera, a hundred or more a frame",
+    ),
+    FindingCode.NO_KV: _Entry(
+        Severity.WARNING,
+        "{count} flats state a current and no kV: flats of several voltages cannot be told apart, and nothing is known of the"
+        " spectrum; write the kV of every flat",
     ),
     FindingCode.MISSING: _Entry(Severity.NOTE, "{what}"),
     FindingCode.SINGLE_FRAME: _Entry(

@@ -126,6 +126,18 @@ def test_a_label_whose_case_is_wrong_is_no_missing_label(broken, session, tmp_pa
         open_acquisition(path)
 
 
+def test_flats_of_two_voltages_that_nobody_states_are_no_beam(broken, session, tmp_path):
+    path = tmp_path / "session.h5"
+    path.write_bytes(session.read_bytes())
+    with h5py.File(path, "r+") as file:
+        for item in file["series"].values():
+            item.attrs.pop("kV", None)
+    told = [item for item in check_acquisition(path).findings if item.severity != "note"]
+    assert [item.code for item in told] == [FindingCode.NO_KV]
+    with pytest.raises(InputError, match=r"flats without kV: got \d+ to \d+ DN a mAs; .* state the kV of every flat"):
+        calibrate(path)
+
+
 def test_flats_that_calibrate_nothing_are_told(broken, session, tmp_path):
     path = tmp_path / "session.h5"
     path.write_bytes(session.read_bytes())

@@ -176,3 +176,25 @@ def count_equal(frames: Any, highest: Any, value: int, times: Any) -> None:
                 for p in range(stop - start):
                     found += row[p] == value
         times[block] = found
+
+
+@njit(parallel=True, cache=True)  # type: ignore[untyped-decorator]
+def add_what_neighbours_leave(change: Any, places: Any, counts: Any, own: Any, left: Any) -> None:
+    """Add squares of a map (row, column), and of what the mean of neighbours leaves of it; pixels at the border are left out.
+
+    places: (source, neighbour, 2), rows and columns away; counts: neighbours of each source. own: (row, column); left: (source,
+    row, column).
+    """
+    rows, columns = change.shape
+    for row in prange(1, rows - 1):
+        for column in range(1, columns - 1):
+            own[row, column] += change[row, column] ** 2
+        for source in range(len(counts)):
+            share = np.float32(1.0 / counts[source])
+            rest = change[row].copy()
+            for number in range(counts[source]):
+                down, across = places[source, number]
+                for column in range(1, columns - 1):
+                    rest[column] -= share * change[row + down, column + across]
+            for column in range(1, columns - 1):
+                left[source, row, column] += rest[column] * rest[column]

@@ -1,6 +1,5 @@
 """Pixels that firmware has replaced by means of their neighbours: they hold less noise, and share it with these."""
 
-import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -18,7 +17,7 @@ _SOURCES = (
     _NEAR,
     (*_NEAR, *_FAR),
 )
-_DIFFERENCES = 64  # of frames, over all series: more tell no more
+_DIFFERENCES = 32  # of frames, over all series: chance then leaves a tenth of the noise at least
 _LEAST_DIFFERENCES = 8  # fewer do not tell a pixel without noise of its own from chance
 _CHANCE = 1e-9  # that a pixel with noise of its own looks like one without
 _MOST_LEFT = 0.1  # of the others' noise, by rounding; a pixel that one mean of two was made of has a quarter
@@ -38,23 +37,22 @@ def find_interpolated(series: Sequence[Series]) -> NDArray[np.bool_] | None:
     Returns:
         None: too few frames to tell.
     """
+    from ._kernels import add_what_neighbours_leave
+
     usable = [item for item in series if item.n_frames > 1]
     most = -(-_DIFFERENCES // max(len(usable), 1))
     shape = usable[0].shape if usable else (0, 0)
     own, left = np.zeros(shape, dtype=np.float32), np.zeros((len(_SOURCES), *shape), dtype=np.float32)
+    counts = np.array([len(source) for source in _SOURCES])
+    places = np.zeros((len(_SOURCES), counts.max(), 2), dtype=np.int64)
+    for number, source in enumerate(_SOURCES):
+        places[number, : len(source)] = source
     count = 0
     for item in usable:
         own_here, left_here = np.zeros_like(own), np.zeros_like(left)
         found = 0
         for change in _changes(item, most):
-            own_here += change**2
-            padded = np.pad(change, 1, mode="reflect")
-            rows, columns = shape
-            for number, places in enumerate(_SOURCES):
-                mean = sum(
-                    padded[1 + row : 1 + row + rows, 1 + column : 1 + column + columns] for row, column in places
-                )
-                left_here[number] += (change - mean / len(places)) ** 2
+            add_what_neighbours_leave(change, places, counts, own_here, left_here)
             found += 1
         typical = float(np.median(own_here))
         if found and typical > 0:
@@ -67,9 +65,10 @@ def find_interpolated(series: Sequence[Series]) -> NDArray[np.bool_] | None:
     # over the median of chi-square of so many degrees
     least = min(_MOST_LEFT, float(gammaincinv(0.5 * count, _CHANCE) / gammaincinv(0.5 * count, 0.5)))
     result = np.zeros(shape, dtype=bool)
-    for squares in left:
-        share = squares / np.maximum(own, np.finfo(np.float32).tiny)
-        result |= (squares < least * _nearby(squares)) & (share < least * _nearby(share))
+    inside = np.s_[1:-1, 1:-1]
+    for squares in left[:, *inside]:
+        share = squares / np.maximum(own[inside], np.finfo(np.float32).tiny)
+        result[inside] |= (squares < least * _nearby(squares)) & (share < least * _nearby(share))
     return result
 
 
@@ -89,11 +88,13 @@ def _changes(item: Series, most: int) -> Iterator[NDArray[np.float32]]:
 
 
 def _nearby(values: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Median of the block that each pixel lies in (row, column)."""
-    rows, columns = (max(1, math.ceil(side / _BLOCK_PX)) for side in values.shape)
-    result = np.empty_like(values)
-    for down in np.array_split(np.arange(values.shape[0]), rows):
-        for across in np.array_split(np.arange(values.shape[1]), columns):
-            part = np.s_[down[0] : down[-1] + 1, across[0] : across[-1] + 1]
-            result[part] = np.median(values[part])
-    return result
+    """Median of the block that each pixel lies in (row, column); pixels beyond the last whole block take that one's."""
+    sides = [min(_BLOCK_PX, side) for side in values.shape]
+    rows, columns = (side // block for side, block in zip(values.shape, sides, strict=True))
+    whole = values[: rows * sides[0], : columns * sides[1]].reshape(rows, sides[0], columns, sides[1])
+    medians = np.median(whole.swapaxes(1, 2).reshape(rows, columns, -1), axis=-1)
+    down, across = (
+        np.minimum(np.arange(side) // block, count - 1)
+        for side, block, count in zip(values.shape, sides, (rows, columns), strict=True)
+    )
+    return np.asarray(medians[np.ix_(down, across)])

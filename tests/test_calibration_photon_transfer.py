@@ -276,7 +276,7 @@ def test_pixels_that_firmware_replaced_are_found_and_left_out(tmp_path):
     found = planted(tmp_path, replace_pixels)
     marked = found.maps.bad_pixels == BAD_PIXEL_CODES["interpolated"]
     expected = replaced.copy()
-    expected[:, column] = True
+    expected[1:-1, column] = True  # pixels at the border are not judged
     # of two alike nobody knows which is the copy
     expected[copied] = expected[copied[0], copied[1] + 1] = True
     assert np.array_equal(marked, expected)

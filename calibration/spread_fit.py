@@ -1153,7 +1153,7 @@ def _other_route(problem: _Problem, item: _Candidate, expected: Sequence[FloatAr
     """Gain by extrapolation of the low-frequency power to 0, over the fit's, and its standard deviation.
 
     The ratio of measured to fitted power of the quanta, up to 0.2 cycles a pixel, as 1 + a + b f_row^2 + c f_column^2: it
-    asks no kernel family, only that the ratio is smooth.
+    asks no kernel family, only that the ratio is smooth. Squares of 16 px have too few frequencies there: their mean is 1 + a.
     """
     rows, weights, values = [], [], []
     read = float(item.coefficients[2 * problem.groups])
@@ -1177,7 +1177,8 @@ def _other_route(problem: _Problem, item: _Candidate, expected: Sequence[FloatAr
     design, weight, value = np.concatenate(rows), np.concatenate(weights), np.concatenate(values)
     information = design.T @ (design * weight[:, None])
     if np.linalg.matrix_rank(information / np.trace(information)) < 3:
-        return 1.0, math.inf
+        design = design[:, :1]
+        information = design.T @ (design * weight[:, None])
     covariance = np.linalg.inv(information)
     ratio = 1.0 + float((covariance @ (design.T @ (weight * value)))[0])
     return ratio, math.sqrt(float(covariance[0, 0]))

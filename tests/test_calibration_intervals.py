@@ -12,7 +12,7 @@ from raytwin.calibration.flat_levels import median_variance
 from raytwin.calibration.priors import SHARES_CORRELATION, TABLE_SHARE
 from raytwin.calibration.spectral_fit import _sd_of_mixture, fit_spectrum
 from raytwin.generator.line.twin import Estimate, Level, NoiseModel, estimate_from_sd, gaussian_spread
-from raytwin.generator.line.twin_spectrum import slope_over_gain
+from raytwin.generator.line.twin_spectrum import secondary_of_levels, slope_over_gain
 from raytwin.generator.spread.psf import blur_variance_share
 
 
@@ -79,30 +79,39 @@ def levels_with(slope_of_gain, gains):
     ]
 
 
-def noise_of(sigma_px):
+def noise_of(sigma_px, white_fraction):
     return NoiseModel(
         spread=gaussian_spread("aperture", Estimate(value=sigma_px, low=sigma_px, high=sigma_px)),
-        white_fraction=0.01,
+        white_fraction=white_fraction,
         read_noise_DN=estimate_from_sd(1.0, 0.01),
         quantised=True,
     )
 
 
-def test_white_noise_of_secondary_quanta_is_the_same_in_every_beam():
+@pytest.mark.parametrize("secondary", [0.02, 2.5])
+def test_white_noise_of_secondary_quanta_is_the_same_in_every_beam(secondary):
     share = blur_variance_share("aperture", 0.7)
-    secondary = 0.02
+    gains = [4.0, 6.0]
+    mean_gain = math.sqrt(math.prod(gains))
+    noise = noise_of(0.7, secondary / (mean_gain - secondary))
 
     def slope(gain):
         return share * (gain - secondary) + secondary
 
-    found = slope_over_gain(levels_with(slope, [4.0, 6.0]), noise_of(0.7), np.array([3.5, 4.9, 8.0]))
+    levels = levels_with(slope, gains)
+    assert secondary_of_levels(levels, noise) == pytest.approx(secondary)
+    found = slope_over_gain(levels, noise, np.array([3.5, 4.9, 8.0]))
     assert found is not None
-    # the mean of the levels' ratios stands for that at their mean gain: right to second order in 1 % of white noise
-    assert found == pytest.approx([slope(gain) / gain for gain in (3.5, 4.9, 8.0)], rel=1e-3)
+    # the mean of the levels' ratios stands for that at their mean gain: right to second order in the spread of gains
+    assert found == pytest.approx(
+        [slope(gain) / gain for gain in (3.5, 4.9, 8.0)], rel=1e-3 if secondary < 1.0 else 0.02
+    )
     assert found[0] > found[2]
 
 
-def test_a_slope_that_no_secondary_quanta_explain_keeps_one_ratio_to_the_gain():
-    found = slope_over_gain(levels_with(lambda gain: 0.5 * gain, [4.0, 6.0]), noise_of(0.9), np.array([3.0, 9.0]))
+def test_slopes_without_noise_of_secondary_quanta_keep_one_ratio_to_the_gain():
+    noise = noise_of(0.9, 0.0)
+    found = slope_over_gain(levels_with(lambda gain: 0.5 * gain, [4.0, 6.0]), noise, np.array([3.0, 9.0]))
     assert found == pytest.approx([0.5, 0.5])
-    assert slope_over_gain([], noise_of(0.9), np.array([3.0])) is None
+    assert slope_over_gain([], noise, np.array([3.0])) is None
+    assert secondary_of_levels([], noise) is None

@@ -111,6 +111,8 @@ def test_series_whose_noise_strays_widen_every_predicted_noise(twin):
 
     none = relative_half_width(None)
     assert relative_half_width({"relative_sd": 0.0, "degrees": 4.0}) == none
+    with pytest.raises(InputError, match=r"`scatter_of_noise` that cannot be read; .* calibrate again"):
+        relative_half_width({"degrees": 4.0})
     # power strays by 6 %, noise by half of it
     straying = relative_half_width({"relative_sd": 0.06, "degrees": 4.0})
     assert straying == pytest.approx(math.hypot(none, 1.96 * 0.03), rel=0.02)

@@ -1,5 +1,6 @@
 """The flats that a twin was calibrated with, as its evidence tells them."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -49,14 +50,32 @@ def stray_of_flats(twin: Twin) -> float:
     As the calibrating flats show it (`scatter_of_flats` of the evidence), and no less than lines do usually: one session does not
     show what another day brings.
     """
-    found = twin.evidence.get("scatter_of_flats")
-    return max(USUAL_STRAY, float(found["relative_sd"])) if isinstance(found, Mapping) else USUAL_STRAY
+    return max(USUAL_STRAY, _scatter(twin, "scatter_of_flats"))
 
 
 def stray_of_noise(twin: Twin) -> float:
     """Relative standard deviation by which a series' noise power strays from what was fitted to all (`scatter_of_noise`)."""
-    found = twin.evidence.get("scatter_of_noise")
-    return float(found["relative_sd"]) if isinstance(found, Mapping) else 0.0
+    return _scatter(twin, "scatter_of_noise")
+
+
+def _scatter(twin: Twin, name: str) -> float:
+    """A scatter of the evidence; 0 where it has none.
+
+    Raises:
+        InputError: one that is no number of 0 or more.
+    """
+    found = twin.evidence.get(name)
+    if found is None:
+        return 0.0
+    value = found.get("relative_sd") if isinstance(found, Mapping) else found
+    if not isinstance(value, int | float) or not 0.0 <= value < math.inf:
+        raise InputError(
+            "evidence of the twin",
+            received=f"`{name}` that cannot be read",
+            expected="a `relative_sd` of 0 or more",
+            remedy="calibrate again",
+        )
+    return float(value)
 
 
 def _flat(point: Mapping[str, Any]) -> MeasuredFlat:

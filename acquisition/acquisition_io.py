@@ -374,29 +374,27 @@ def _by(shape: Sequence[int] | None) -> str:
 
 _SERIES_WORDS = {
     word.lower(): word
-    for word in (
-        *(
-            "kind",
-            "index",
-            "kV",
-            "current_mA",
-            "power_W",
-            "exposure_ms",
-            "filter",
-            "averaged",
-            "binning",
-            "source_detector_mm",
-        ),
-        *(
-            "source_object_mm",
-            "frame_interval_ms",
-            "belt_speed_mm_s",
-            "panel_rotation_deg",
-            "photons_per_pixel",
-            "scene",
-        ),
-        *("corrected", "role", "layer"),
-    )
+    for word in [
+        "kind",
+        "index",
+        "role",
+        "layer",
+        "scene",
+        "corrected",
+        "kV",
+        "current_mA",
+        "power_W",
+        "exposure_ms",
+        "filter",
+        "averaged",
+        "binning",
+        "frame_interval_ms",
+        "belt_speed_mm_s",
+        "panel_rotation_deg",
+        "source_object_mm",
+        "source_detector_mm",
+        "photons_per_pixel",
+    ]
 }
 
 

@@ -178,10 +178,10 @@ def same_scene(pieces: Iterable[NDArray[Any]], *, offset_DN: float = 0.0, lit: b
 
 def with_median_at(frames: NDArray[Any], pixels: NDArray[np.bool_]) -> NDArray[Any]:
     """The frames (m, row, column) with the median of each at these pixels (row, column)."""
-    if not pixels.any():
+    if not pixels.any() or pixels.all():
         return frames
     result = frames.copy()
-    result[:, pixels] = np.median(frames[:, ~pixels], axis=1, keepdims=True) if not pixels.all() else 0
+    result[:, pixels] = np.median(frames[:, ~pixels], axis=1, keepdims=True)
     return result
 
 

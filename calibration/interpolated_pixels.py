@@ -49,17 +49,9 @@ def find_interpolated(series: Sequence[Series]) -> NDArray[np.bool_] | None:
         places[number, : len(source)] = source
     count = 0
     for item in usable:
-        own_here, left_here = np.zeros_like(own), np.zeros_like(left)
-        found = 0
         for change in _changes(item, most):
-            add_what_neighbours_leave(change, places, counts, own_here, left_here)
-            found += 1
-        typical = float(np.median(own_here))
-        if found and typical > 0:
-            # each difference counts alike, bright or dark
-            own += own_here * (found / typical)
-            left += left_here * (found / typical)
-            count += found
+            add_what_neighbours_leave(change, places, counts, own, left)
+            count += 1
     if count < _LEAST_DIFFERENCES:
         return None
     # over the median of chi-square of so many degrees
@@ -73,7 +65,8 @@ def find_interpolated(series: Sequence[Series]) -> NDArray[np.bool_] | None:
 
 
 def _changes(item: Series, most: int) -> Iterator[NDArray[np.float32]]:
-    """Differences (row, column) of pairs of frames that share none, without their mean, DN."""
+    """Differences (row, column) of pairs of frames that share none, less their median, over what half of them exceed: bright and dark
+    ones count alike, and those of which more than half are 0 tell nothing."""
     first: NDArray[np.float64] | None = None
     for piece in item.iter_frames(maximum_bytes=PIECE_BYTES):
         for frame in piece:
@@ -83,7 +76,10 @@ def _changes(item: Series, most: int) -> Iterator[NDArray[np.float32]]:
                 first = frame.astype(np.float64)
                 continue
             change = frame - first
-            yield (change - np.median(change)).astype(np.float32)
+            change -= np.median(change)
+            half = float(np.median(np.abs(change)))
+            if half > 0:
+                yield (change / half).astype(np.float32)
             first, most = None, most - 1
 
 

@@ -353,15 +353,16 @@ def _check_one_beam(levels: Sequence[tuple[Series, float]]) -> None:
     """
     groups: dict[tuple[Any, ...], list[float]] = {}
     for item, signal_DN in levels:
-        if item.kV is None and item.current_mA and item.exposure_ms and signal_DN > 0:
-            group = (item.session, item.filters, item.source_detector_mm)
-            groups.setdefault(group, []).append(signal_DN / (item.current_mA * item.exposure_ms))
-    for rates in groups.values():
+        unit, load = ("mAs", item.current_mA) if item.current_mA else ("Ws", item.power_W)
+        if item.kV is None and load and item.exposure_ms and signal_DN > 0:
+            group = (unit, item.session, item.filters, item.source_detector_mm)
+            groups.setdefault(group, []).append(1000.0 * signal_DN / (load * item.exposure_ms))
+    for (unit, *_), rates in groups.items():
         if max(rates) > _ONE_BEAM * min(rates):
             raise InputError(
                 "flats without kV",
-                received=f"{1000 * min(rates):.0f} to {1000 * max(rates):.0f} DN a mAs",
-                expected="one beam, whose signal is proportional to current and exposure",
+                received=f"{min(rates):.0f} to {max(rates):.0f} DN a {unit}",
+                expected="one beam, whose signal is proportional to current or power, and to exposure",
                 remedy="state the kV of every flat: those of several voltages have gains of their own",
             )
 
@@ -500,7 +501,10 @@ def spread_estimate(fit: SpreadFit) -> SpreadEstimate:
 
 
 def _white_fraction(fit: SpreadFit) -> float:
-    """White noise that follows the signal over that of quanta, at the mean gain: it is the same in all beams, DN."""
+    """White noise that follows the signal over that of quanta, no unit, in a beam of the mean gain.
+
+    In DN of variance for each DN of signal that white noise is the same in all beams.
+    """
     lit = np.isfinite(fit.white_fraction) & (fit.gain_DN > 0)
     if not lit.any():
         return 0.0

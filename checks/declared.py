@@ -1,13 +1,12 @@
 """What the labels of an acquisition name that nobody knows: anodes, tube voltages, materials."""
 
 from ..acquisition.acquisition_io import AcquisitionFile
+from ..acquisition.instrument import LAYER_FIELDS
 from ..acquisition.setting import Filter, text_from_filters
 from ..errors import InputError
 from ..materials import material_from_name
 from ..spectra import checked_kV
 from .findings import Finding, FindingCode
-
-_LAYERS = ("inherent_filtration", "scintillator", "detector_cover", "back_scintillator", "interlayer")
 
 
 def unknown_words(acquisition: AcquisitionFile) -> tuple[list[Finding], set[str]]:
@@ -21,7 +20,7 @@ def unknown_words(acquisition: AcquisitionFile) -> tuple[list[Finding], set[str]
         told.setdefault(text, Finding(code=FindingCode.UNKNOWN, series=series, values={"what": text}))
         named.add(series)
 
-    for layers in _LAYERS:
+    for layers in LAYER_FIELDS:
         try:
             _check_materials(layers, getattr(instrument, layers) or ())
         except InputError as error:

@@ -73,7 +73,7 @@ _ENTRIES: dict[FindingCode, _Entry] = {
     FindingCode.CORRECTED_FLATS: _Entry(
         Severity.ERROR,
         "all flats are divided by a gain map or are logarithms, so they hold neither level nor noise: export them raw, or with"
-        " the offset alone taken off",
+        " the offset alone subtracted",
     ),
     FindingCode.NO_DARK: _Entry(
         Severity.ERROR,

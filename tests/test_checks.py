@@ -5,6 +5,7 @@ import math
 import re
 import sys
 import tomllib
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -33,6 +34,15 @@ def broken():
         yield import_module("broken_sessions")
     finally:
         sys.path.remove(str(FOLDER))
+
+
+@contextmanager
+def copy_of(session, folder):
+    """A copy of a session, and its file to change."""
+    path = folder / "session.h5"
+    path.write_bytes(session.read_bytes())
+    with h5py.File(path, "r+") as file:
+        yield path, file
 
 
 @pytest.fixture(scope="module")
@@ -106,9 +116,7 @@ def test_stuck_and_wildly_noisy_pixels_make_no_flat_saturated_and_no_scene_chang
     ],
 )
 def test_words_that_nobody_knows_are_told_as_they_were_written(broken, session, tmp_path, changed, series, text):
-    path = tmp_path / "session.h5"
-    path.write_bytes(session.read_bytes())
-    with h5py.File(path, "r+") as file:
+    with copy_of(session, tmp_path) as (path, file):
         (file[f"series/{broken.VICTIM}"] if series else file["instrument"]).attrs.update(changed)
     (found,) = (item for item in check_acquisition(path).findings if item.severity == "error")
     assert found.code == FindingCode.UNKNOWN and found.series == (broken.VICTIM if series else "")
@@ -116,9 +124,7 @@ def test_words_that_nobody_knows_are_told_as_they_were_written(broken, session, 
 
 
 def test_a_label_whose_case_is_wrong_is_no_missing_label(broken, session, tmp_path):
-    path = tmp_path / "session.h5"
-    path.write_bytes(session.read_bytes())
-    with h5py.File(path, "r+") as file:
+    with copy_of(session, tmp_path) as (path, file):
         labels = file[f"series/{broken.VICTIM}"].attrs
         labels["kv"] = labels["kV"]
         del labels["kV"]
@@ -127,9 +133,7 @@ def test_a_label_whose_case_is_wrong_is_no_missing_label(broken, session, tmp_pa
 
 
 def test_flats_of_two_voltages_that_nobody_states_are_no_beam(broken, session, tmp_path):
-    path = tmp_path / "session.h5"
-    path.write_bytes(session.read_bytes())
-    with h5py.File(path, "r+") as file:
+    with copy_of(session, tmp_path) as (path, file):
         for item in file["series"].values():
             item.attrs.pop("kV", None)
     told = [item for item in check_acquisition(path).findings if item.severity != "note"]
@@ -139,9 +143,7 @@ def test_flats_of_two_voltages_that_nobody_states_are_no_beam(broken, session, t
 
 
 def test_flats_that_calibrate_nothing_are_told(broken, session, tmp_path):
-    path = tmp_path / "session.h5"
-    path.write_bytes(session.read_bytes())
-    with h5py.File(path, "r+") as file:
+    with copy_of(session, tmp_path) as (path, file):
         for item in file["series"].values():
             if item.attrs["kind"] == "flat":
                 item.attrs["corrected"] = "offset+gain"

@@ -376,7 +376,7 @@ def _spectral_from_group(group: Any, path: object) -> SpectralPosterior:
         level_discrepancy=float(attributes["level_discrepancy"]),
         gain_discrepancy=float(attributes["gain_discrepancy"]),
         kerma_discrepancy=_optional_float(group, "kerma_discrepancy"),
-        secondary_DN=float(attributes.get("secondary_DN", 0.0)),
+        secondary_DN=_optional_float(group, "secondary_DN") or 0.0,
         calibrated_kV=(float(attributes["calibrated_kV"][0]), float(attributes["calibrated_kV"][1])),
         calibrated_filters=_texts(attributes["calibrated_filters"]),
     )
@@ -389,6 +389,13 @@ def _spectral_from_group(group: Any, path: object) -> SpectralPosterior:
             f"twin {path}, spectral",
             received=f"draws of shape {samples.shape} and best of {best.shape}, or values that are not finite",
             expected=f"finite draws (n, {wide}) and best ({wide},), all below {_LARGEST_EXPONENT:.0f}",
+            remedy="calibrate again",
+        )
+    if not 0.0 <= spectral.secondary_DN < math.inf:
+        raise FileFormatError(
+            f"twin {path}, spectral",
+            received=f"secondary_DN of {spectral.secondary_DN}",
+            expected="a number of 0 or more",
             remedy="calibrate again",
         )
     return spectral

@@ -92,8 +92,8 @@ _ENTRIES: dict[FindingCode, _Entry] = {
     ),
     FindingCode.NO_KV: _Entry(
         Severity.WARNING,
-        "{count} flats state a current or power and no kV: flats of several voltages cannot be told apart, and nothing is known of the"
-        " spectrum; write the kV of every flat",
+        "{count} flats state a current or power and no kV: flats of several voltages cannot be told apart, and nothing is known of"
+        " the spectrum; write the kV of every flat",
     ),
     FindingCode.MISSING: _Entry(Severity.NOTE, "{what}"),
     FindingCode.SINGLE_FRAME: _Entry(

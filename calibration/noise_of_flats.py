@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -19,6 +20,7 @@ from .frame_memory import frame_memory
 from .frame_sums import PIECE_BYTES, effective_frames
 from .noise_power import NoisePower, compute_difference_power, compute_noise_power
 from .repeated_frames import Beam, RepeatedFrames, beam_of, most_read_variance, widened
+from .spread_families import spread_axes
 from .spread_fit import SpreadFit, fit_spread
 
 # Elements of converters that free charge instead of light (Kasap et al., Sensors 11 (2011) 5112): nothing spreads as in a screen.
@@ -168,8 +170,12 @@ def fit_flat_noise(
     most_read = most_read_variance(means, good) if darks.effective == 0 else None
     if acquisition.instrument.counting and not darks.sums:
         most_read = 0.0  # a counter has no electronic noise
-    screen = _has_screen(acquisition.instrument)
-    fit = _fit(powers, groups, in_fit, most_read, screen)
+    instrument = acquisition.instrument
+    lit = [power for power, group, keep in zip(powers, groups, in_fit, strict=True) if keep and group >= 0]
+    axes, other_axes = spread_axes(instrument, lit)
+    warnings += [] if other_axes is None else [other_axes]
+    fit_spread_to = partial(_fit, powers, groups, most_read_DN2=most_read, screen=_has_screen(instrument), axes=axes)
+    fit = fit_spread_to(in_fit)
     # a flat above full well or bent by nonlinearity lies below the line: drop the brightest while it does
     bent: list[str] = []
     while True:
@@ -182,7 +188,7 @@ def fit_flat_noise(
             break
         in_fit[worst] = False
         bent.append(stacks[worst][0].name)
-        fit = _fit(powers, groups, in_fit, most_read, screen)
+        fit = fit_spread_to(in_fit)
     memory = frame_memory(stacks, darks, good)
     if memory is not None:
         # the quanta's share lies between what pairs show and what many frames do, and so does that of the electronics
@@ -325,8 +331,10 @@ def _fit(
     powers: Sequence[NoisePower],
     groups: Sequence[int],
     usable: Sequence[bool],
+    *,
     most_read_DN2: float | None,
     screen: bool,
+    axes: str,
 ) -> SpreadFit:
     """The fit to the usable powers; groups of them numbered anew."""
     kept = [index for index, keep in enumerate(usable) if keep]
@@ -337,6 +345,7 @@ def _fit(
         group=[renumbered[groups[index]] for index in kept],
         most_read_DN2=most_read_DN2,
         screen=screen,
+        axes=axes,
     )
 
 

@@ -22,17 +22,7 @@ from ..errors import FitError
 from ..generator.line.twin import OtherSpread
 from ..generator.spread.psf import Spread
 from .noise_power import LARGEST_SQUARE_PX, NoisePower, mode_share, spread_of_bins, usable
-from .spread_families import (
-    CORES,
-    FAMILIES,
-    GENERAL,
-    LOG_REACH,
-    SIMPLEST,
-    TAIL,
-    prior_of_models,
-    reach_mass,
-    share_density,
-)
+from .spread_families import LOG_REACH, TAIL, Family, forms_of, prior_of_models, reach_mass, share_density
 
 FloatArray = NDArray[np.float64]
 # White noise proportional to signal beside the quanta (secondary quanta): 1/K of the quantum variance for K electrons a
@@ -135,7 +125,7 @@ class SpreadFit:
 class _Candidate:
     """One family at its best."""
 
-    family: str
+    form: Family
     theta: FloatArray  # those held fixed have no variance in `covariance`
     spread: Spread
     coefficients: FloatArray
@@ -146,8 +136,8 @@ class _Candidate:
     share_slopes: FloatArray  # its derivatives by theta
 
     @property
-    def names(self) -> tuple[str, ...]:
-        return FAMILIES[self.family].names
+    def family(self) -> str:
+        return self.form.name
 
     @property
     def lit(self) -> bool:
@@ -296,8 +286,15 @@ class _Problem:
     """
 
     def __init__(
-        self, series: Sequence[NoisePower], group: Sequence[int], most_read_DN2: float | None, *, screen: bool
+        self,
+        series: Sequence[NoisePower],
+        group: Sequence[int],
+        most_read_DN2: float | None,
+        *,
+        screen: bool,
+        axes: str,
     ) -> None:
+        self.forms = forms_of(axes)
         self.prior = prior_of_models(screen=screen)
         self.series = list(series)
         self.group = list(group)
@@ -567,28 +564,28 @@ def _slow(side: int) -> FloatArray:
     return np.stack([np.sqrt(8.0 / square), 8.0 / square])
 
 
-def _starts(family: str) -> list[FloatArray]:
+def _starts(form: Family) -> list[FloatArray]:
     """Where a family's descent begins."""
-    return [np.array([one[name] for name in FAMILIES[family].names]) for one in _STARTS]
+    return [np.array([one[name] for name in form.names]) for one in _STARTS]
 
 
-def _fitted(problem: _Problem, family: str, starts: Sequence[FloatArray], *, fixed: Sequence[str] = ()) -> _Candidate:
+def _fitted(problem: _Problem, form: Family, starts: Sequence[FloatArray], *, fixed: Sequence[str] = ()) -> _Candidate:
     """A family at its best, with the parameters `fixed` as they start."""
-    names = FAMILIES[family].names
+    names = form.names
     free = [place for place, name in enumerate(names) if name not in fixed]
     bounds = np.array([_BOUNDS[name] for name in names]).T
     if "log_tail_px" in names:
         bounds[:, names.index("log_tail_px")] = LOG_REACH
     bounds[1, names.index("sigma_px2")] = (_WIDEST_CORE * max(problem.sides)) ** 2
     tried = [
-        _descended(problem, family, np.clip(one, bounds[0], bounds[1]), bounds, free)
+        _descended(problem, form, np.clip(one, bounds[0], bounds[1]), bounds, free)
         for one in {tuple(one): one for one in starts}.values()
     ]
     theta, chi_square = min(tried, key=lambda one: one[1])
-    spread = FAMILIES[family].spread(theta)
+    spread = form.spread(theta)
     coefficients, _ = problem.solve(spread)
     normal = problem.normal(
-        problem.in_cells(spread), coefficients[: problem.groups], _slopes(problem, family, theta, free)
+        problem.in_cells(spread), coefficients[: problem.groups], _slopes(problem, form, theta, free)
     ).with_white_prior(problem.white_prior(coefficients))
     linear = len(coefficients)
     places = [*range(linear), *(linear + place for place in free)]
@@ -596,10 +593,10 @@ def _fitted(problem: _Problem, family: str, starts: Sequence[FloatArray], *, fix
     covariance[np.ix_(places, places)] = normal.covariance()
     share_slopes = np.zeros(len(names))
     for place in free:
-        (above, more), (below, less) = _moved(family, theta, place)
+        (above, more), (below, less) = _moved(form, theta, place)
         share_slopes[place] = (_variance_share(problem, more) - _variance_share(problem, less)) / (above - below)
     share = _variance_share(problem, spread)
-    return _Candidate(family, theta, spread, coefficients, covariance, chi_square, problem.groups, share, share_slopes)
+    return _Candidate(form, theta, spread, coefficients, covariance, chi_square, problem.groups, share, share_slopes)
 
 
 def _variance_share(problem: _Problem, spread: Spread) -> float:
@@ -608,14 +605,14 @@ def _variance_share(problem: _Problem, spread: Spread) -> float:
     return float(np.sum(mode_share(side) * spread.noise_power(side)))
 
 
-def _moved(family: str, theta: FloatArray, place: int) -> list[tuple[float, Spread]]:
+def _moved(form: Family, theta: FloatArray, place: int) -> list[tuple[float, Spread]]:
     """A parameter of the spread a little more and a little less, with the spreads that it makes."""
-    name = FAMILIES[family].names[place]
+    name = form.names[place]
     ends = []
     for step in (0.005, -0.005):
         moved = theta.copy()
         moved[place] = np.clip(theta[place] + step, *_BOUNDS[name])
-        ends.append((float(moved[place]), FAMILIES[family].spread(moved)))
+        ends.append((float(moved[place]), form.spread(moved)))
     return ends
 
 
@@ -625,8 +622,8 @@ def _with_share(problem: _Problem, best: _Candidate, share_at: int, share: float
     place = linear + share_at
     follows = best.covariance[place] / best.covariance[place, place]
     theta = best.theta + follows[linear:] * (share - best.theta[share_at])
-    theta = np.array([np.clip(value, *_BOUNDS[name]) for name, value in zip(best.names, theta, strict=True)])
-    spread = FAMILIES[best.family].spread(theta)
+    theta = np.array([np.clip(value, *_BOUNDS[name]) for name, value in zip(best.form.names, theta, strict=True)])
+    spread = best.form.spread(theta)
     coefficients, chi_square = problem.solve(spread)
     return replace(
         best,
@@ -639,33 +636,33 @@ def _with_share(problem: _Problem, best: _Candidate, share_at: int, share: float
     )
 
 
-def _slopes(problem: _Problem, family: str, theta: FloatArray, free: Sequence[int]) -> list[dict[int, FloatArray]]:
+def _slopes(problem: _Problem, form: Family, theta: FloatArray, free: Sequence[int]) -> list[dict[int, FloatArray]]:
     """Derivatives of the shapes (cell,), by side, by the parameters of the spread at the places `free`."""
     found = []
     for place in free:
-        (above, more), (below, less) = _moved(family, theta, place)
+        (above, more), (below, less) = _moved(form, theta, place)
         shapes = problem.in_cells(more), problem.in_cells(less)
         found.append({side: (shapes[0][side] - shapes[1][side]) / (above - below) for side in problem.sides})
     return found
 
 
 def _descended(
-    problem: _Problem, family: str, theta: FloatArray, bounds: FloatArray, free: Sequence[int]
+    problem: _Problem, form: Family, theta: FloatArray, bounds: FloatArray, free: Sequence[int]
 ) -> tuple[FloatArray, float]:
     """Parameters of the spread at the least chi-square near a start, and that chi-square (Gauss and Newton's steps, halved
     until they help)."""
-    coefficients, chi_square = problem.solve(FAMILIES[family].spread(theta))
+    coefficients, chi_square = problem.solve(form.spread(theta))
     for _ in range(_MOST_STEPS):
         normal = problem.normal(
-            problem.in_cells(FAMILIES[family].spread(theta)),
+            problem.in_cells(form.spread(theta)),
             coefficients[: problem.groups],
-            _slopes(problem, family, theta, free),
+            _slopes(problem, form, theta, free),
         ).with_white_prior(problem.white_prior(coefficients))
         step = np.zeros(len(theta))
         step[list(free)] = normal.solved(problem.not_negative)[0][-len(free) :]
         for share in (1.0, 0.5, 0.25, 0.1, 0.03):
             moved = np.clip(theta + share * step, bounds[0], bounds[1])
-            there, value = problem.solve(FAMILIES[family].spread(moved))
+            there, value = problem.solve(form.spread(moved))
             if value < chi_square:
                 break
         else:
@@ -677,16 +674,18 @@ def _descended(
     return theta, chi_square
 
 
-def _cores(problem: _Problem) -> dict[str, _Candidate]:
+def _cores(problem: _Problem) -> list[_Candidate]:
     """Families without a tail at their best; the weights are those of the best spread."""
+    simplest, general = problem.forms.cores[0], problem.forms.general["aperture"]
     found: dict[str, _Candidate] = {}
     for _ in range(_REWEIGHTED):
-        for family in (SIMPLEST, GENERAL["aperture"]):
-            found[family] = _fitted(problem, family, [found[family].theta] if family in found else _starts(family))
+        for form in (simplest, general):
+            starts = [found[form.name].theta] if form.name in found else _starts(form)
+            found[form.name] = _fitted(problem, form, starts)
         best = min(found.values(), key=lambda item: _criterion(problem, item))
         problem.reweight(best.spread, best.coefficients)
-        _learn_changes(problem, found[GENERAL["aperture"]])
-    return {family: _fitted(problem, family, _starts(family)) for family in CORES}
+        _learn_changes(problem, found[general.name])
+    return [_fitted(problem, form, _starts(form)) for form in problem.forms.cores]
 
 
 def _learn_changes(problem: _Problem, item: _Candidate) -> None:
@@ -696,7 +695,7 @@ def _learn_changes(problem: _Problem, item: _Candidate) -> None:
     normal = problem.normal(
         problem.in_cells(item.spread),
         coefficients[: problem.groups],
-        _slopes(problem, item.family, item.theta, range(len(item.theta))),
+        _slopes(problem, item.form, item.theta, range(len(item.theta))),
     ).with_white_prior(problem.white_prior(coefficients))
     problem.learn_changes(normal, max(1.0, chi_square / problem.independent))
 
@@ -706,22 +705,22 @@ def _criterion(problem: _Problem, candidate: _Candidate) -> float:
 
     A tail is weighed by its prior instead: its share and reach are averaged over.
     """
-    core = len(set(candidate.names) - set(TAIL))
+    core = len(set(candidate.form.names) - set(TAIL))
     return candidate.chi_square + core * math.log(max(problem.independent, 2.0))
 
 
 def _with_tails(
-    problem: _Problem, core: _Candidate, known: Mapping[str, _OfReaches]
+    problem: _Problem, core: _Candidate, known: Mapping[Family, _OfReaches]
 ) -> Iterator[tuple[float, _Candidate]]:
     """Spreads with this core and tails of all laws, reaches and shares, each with its prior probability among tails.
 
     known: families whose reaches have been tried.
     """
-    for family, form in FAMILIES.items():
-        if form.model != core.spread.model or set(form.names) != {*core.names, *TAIL}:
+    for form in problem.forms.families:
+        if form.model != core.spread.model or set(form.names) != {*core.form.names, *TAIL}:
             continue
         share_at = form.names.index("tail_share")
-        for of_reach, best in known.get(family) or _of_reaches(problem, family):
+        for of_reach, best in known.get(form) or _of_reaches(problem, form):
             variance = float(best.covariance[len(best.coefficients) + share_at, len(best.coefficients) + share_at])
             if variance <= 0.0:
                 yield form.of_tails * of_reach, best
@@ -732,22 +731,22 @@ def _with_tails(
                 yield width * density, _with_share(problem, best, share_at, share)
 
 
-def _of_reaches(problem: _Problem, family: str) -> _OfReaches:
+def _of_reaches(problem: _Problem, form: Family) -> _OfReaches:
     """The best spread of a family at each of some reaches of the tail, with its share of all reaches."""
-    place = FAMILIES[family].names.index("log_tail_px")
+    place = form.names.index("log_tail_px")
     count = 1 + math.ceil((LOG_REACH[1] - LOG_REACH[0]) / _REACH_STEP)
     grid = np.linspace(*LOG_REACH, count)
     step = float(grid[1] - grid[0])
     found: _OfReaches = []
-    starts = _starts(family)
+    starts = _starts(form)
     for reach in grid:
         for start in starts:
             start[place] = reach
-        item = _fitted(problem, family, starts, fixed=("log_tail_px",))
+        item = _fitted(problem, form, starts, fixed=("log_tail_px",))
         found.append((reach_mass(float(reach), step if grid[0] < reach < grid[-1] else 0.5 * step), item))
         starts = [item.theta.copy()]
     best = min((item for _, item in found), key=lambda item: item.chi_square)
-    free = _fitted(problem, family, [best.theta])
+    free = _fitted(problem, form, [best.theta])
     sd = math.sqrt(max(float(free.covariance[len(free.coefficients) + place, len(free.coefficients) + place]), 0.0))
     if not 0.0 < sd < 0.5 * step:
         return found
@@ -755,7 +754,7 @@ def _of_reaches(problem: _Problem, family: str) -> _OfReaches:
     for reach, width in _steps(float(free.theta[place]), sd, LOG_REACH):
         theta = free.theta.copy()
         theta[place] = reach
-        sharp.append((reach_mass(reach, width), _fitted(problem, family, [theta], fixed=("log_tail_px",))))
+        sharp.append((reach_mass(reach, width), _fitted(problem, form, [theta], fixed=("log_tail_px",))))
     return sharp
 
 
@@ -771,13 +770,15 @@ def _members(problem: _Problem) -> list[tuple[float, _Candidate]]:
 
     Tails are averaged over for the way that quanta meet pixels that is likelier with the best spread of any form.
     """
-    cores = list(_cores(problem).values())
-    general = {family: _of_reaches(problem, family) for family in GENERAL.values()}
+    cores = _cores(problem)
+    general = {form: _of_reaches(problem, form) for form in problem.forms.general.values()}
     best, least = {}, {}
     for model in problem.prior:
         own = [item for item in cores if item.spread.model == model]
         best[model] = min([item for item in own if item.lit] or own, key=partial(_criterion, problem))
-        least[model] = min(item.chi_square for item in (*own, *(item for _, item in general[GENERAL[model]])))
+        least[model] = min(
+            item.chi_square for item in (*own, *(item for _, item in general[problem.forms.general[model]]))
+        )
     likeliest = max(problem.prior, key=lambda model: math.log(problem.prior[model][0]) - 0.5 * least[model])
     found = []
     for model, (prior, no_tail) in problem.prior.items():
@@ -798,6 +799,7 @@ def fit_spread(
     group: Sequence[int],
     most_read_DN2: float | None = None,
     screen: bool = False,
+    axes: str = "both",
 ) -> SpreadFit:
     """Spread, gains and read noise from the noise power of series (weighted least squares, weights from the fit itself).
 
@@ -812,6 +814,7 @@ def fit_spread(
         group: per series, the index of its kV and filter; -1 for darks.
         most_read_DN2: read variance that the darks allow at most, where they were not repeated; 0: there is none.
         screen: whether a screen is known to spread light.
+        axes: index along which light spreads (`spread_axes`).
 
     Raises:
         FitError: no series with signal, or the least-squares problem has no solution.
@@ -822,7 +825,8 @@ def fit_spread(
     """
     if not any(index >= 0 for index in group):
         raise FitError("the noise fit needs at least one flat series with two or more frames")
-    fit = _fit_of(series, group, most_read_DN2, screen)
+    fit_of = partial(_fit_of, group=group, most_read_DN2=most_read_DN2, screen=screen, axes=axes)
+    fit = fit_of(series)
     degrees = len(series) - len(fit.gain_DN) - 1
     scatter = 0.0
     for _ in range(_MOST_ROUNDS):
@@ -831,20 +835,17 @@ def fit_spread(
             break
         # where series differ by more than chance, none of them tells more than that lets it
         shares = [1.0 / (1.0 + scatter * float(item.modes.sum())) for item in series]
-        fit = _fit_of(
-            [replace(item, modes=share * item.modes) for item, share in zip(series, shares, strict=True)],
-            group,
-            most_read_DN2,
-            screen,
-        )
+        fit = fit_of([replace(item, modes=share * item.modes) for item, share in zip(series, shares, strict=True)])
         sampling = zip(fit.series_ratio, shares, strict=True)
         fit = replace(fit, series_ratio=tuple((ratio, sd * math.sqrt(share)) for (ratio, sd), share in sampling))
     return fit
 
 
-def _fit_of(series: Sequence[NoisePower], group: Sequence[int], most_read_DN2: float | None, screen: bool) -> SpreadFit:
+def _fit_of(
+    series: Sequence[NoisePower], *, group: Sequence[int], most_read_DN2: float | None, screen: bool, axes: str
+) -> SpreadFit:
     """`fit_spread` with series that are believed as far as their modes say."""
-    problem = _Problem(series, group, most_read_DN2, screen=screen)
+    problem = _Problem(series, group, most_read_DN2, screen=screen, axes=axes)
     members = _members(problem)
     drifting = _drifting(problem, _likeliest(members))
     if drifting != problem.drifting:
@@ -996,7 +997,7 @@ def _representative(
     near = [place for place in likely if abs(scale[place] - mean) <= _NEAR_THE_MEAN * sd]
     if not near:
         near = [min(likely, key=lambda place: abs(scale[place] - mean))]
-    return candidates[min(near, key=lambda place: (len(candidates[place].names), -weights[place]))]
+    return candidates[min(near, key=lambda place: (len(candidates[place].form.names), -weights[place]))]
 
 
 def _other_families(candidates: Sequence[_Candidate], weights: FloatArray, chosen: str) -> tuple[OtherSpread, ...]:
@@ -1088,7 +1089,7 @@ def _spread_variances(item: _Candidate, inflation: float) -> dict[str, float]:
             max(inflation * float(item.covariance[linear + i, linear + i]), 0.0),
             (_BOUNDS[name][1] - _BOUNDS[name][0]) ** 2 / 12.0,
         )
-        for i, name in enumerate(item.names)
+        for i, name in enumerate(item.form.names)
     }
     # the width at one standard deviation of its square: right also where the width is near 0
     sigma_px = item.spread.sigma_px

@@ -21,7 +21,7 @@ DN_PER_MAS = 200000.0
 WHITE = 0.01
 
 
-def flat_frames(level, *, count=24, rng, gain=GAIN, read_DN=READ_DN, dark=DARK_DN):
+def flat_frames(level, *, count=24, rng, gain=GAIN, read_DN=READ_DN, dark=DARK_DN, axes="both"):
     """Whole-number frames (count, row, column) of a mean level above dark, one number or (row, column)."""
     mean = np.broadcast_to(np.asarray(level, dtype=np.float64), SHAPE)
     frames = [
@@ -32,7 +32,7 @@ def flat_frames(level, *, count=24, rng, gain=GAIN, read_DN=READ_DN, dark=DARK_D
             gain_DN=gain,
             white_fraction=WHITE,
             read_variance_DN2=read_DN**2,
-            spread=Spread(sigma_px=SIGMA),
+            spread=Spread(sigma_px=SIGMA, axes=axes),
             rng=rng,
         )
         for _ in range(count)
@@ -55,10 +55,12 @@ def write_session(
     count=24,
     swap=False,
     seed=0,
+    axes="both",
+    **detector,
 ):
     """Darks and flats at 40 kV, 20 ms; `change` plants a fault in the frames of every series."""
     rng = np.random.default_rng(seed)
-    instrument = Instrument(bits=bits, pixel_mm=0.15, source_detector_mm=1059.0, source_object_mm=990.0)
+    instrument = Instrument(bits=bits, pixel_mm=0.15, source_detector_mm=1059.0, source_object_mm=990.0, **detector)
     with write_acquisition(path, instrument) as writer:
         if with_darks:
             frames = change(flat_frames(0.0, rng=rng, count=count), None, rng)
@@ -67,7 +69,7 @@ def write_session(
         for power in powers:
             setting = Setting(kV=kV, power_W=power, exposure_ms=20.0)
             level = DN_PER_MAS * setting.tube_load_mAs
-            frames = change(flat_frames(level, rng=rng, count=count), setting, rng)
+            frames = change(flat_frames(level, rng=rng, count=count, axes=axes), setting, rng)
             kind = "dark" if swap else "flat"
             writer.add_series(f"flat_{power:g}W", kind=kind, frames=as_adc(frames, bits), setting=setting)
     return path
@@ -105,6 +107,28 @@ def test_a_clean_session_gives_its_truth_and_no_warning(clean):
     assert level.saturation_DN is None
     assert np.all(clean.maps.bad_pixels == 0)
     assert all(point.used for point in clean.points)
+
+
+@pytest.mark.parametrize(("belt_axis", "axes"), [(None, "column"), ("column", "row")])
+def test_the_light_of_a_line_camera_spreads_along_its_lines(tmp_path, belt_axis, axes):
+    path = write_session(tmp_path / "lines.h5", axes=axes, detector="line", belt_axis=belt_axis)
+    found = transfer_of(path)
+    assert found.warnings == ()
+    assert found.noise.spread.value.axes == axes
+    assert is_gain(found.levels[0].gain_DN)
+    share = Spread(sigma_px=SIGMA, axes=axes).variance_share
+    assert found.levels[0].photon_transfer_slope_DN.value == pytest.approx(
+        GAIN * (share + WHITE) / (1 + WHITE), rel=0.03
+    )
+
+
+@pytest.mark.parametrize(("axes", "meant"), [("both", "detector = area or tdi"), ("row", "belt_axis = column")])
+def test_a_line_camera_whose_lines_share_light_is_none_and_its_noise_is_believed(tmp_path, axes, meant):
+    found = transfer_of(write_session(tmp_path / "lines.h5", axes=axes, detector="line"))
+    (warning,) = found.warnings
+    assert f"{meant} is taken to be meant" in warning
+    assert found.noise.spread.value.axes == axes
+    assert is_gain(found.levels[0].gain_DN)
 
 
 @pytest.mark.parametrize(("share", "known"), [(0.1, True), (0.7, False)])

@@ -99,6 +99,17 @@ def test_gains_slopes_and_read_noise_lie_within_their_own_standard_deviations(na
     FAMILIES.get(name, lambda fit: None)(fit)
 
 
+def test_a_line_camera_s_noise_is_that_of_its_lines():
+    spread = Spread(sigma_px=0.5, tail_share=0.2, tail_px=1.0, axes="column")
+    fit = fit_spread(powers(spread, seed=7), group=GROUPS, axes="column", screen=True)
+    assert fit.spread.axes == "column"
+    for place, gain in enumerate((8.0, 14.0)):
+        assert abs(fit.gain_DN[place] - gain) < 3.0 * fit.gain_sd_DN[place] < 0.3 * gain
+        slope = gain * (spread.variance_share + WHITE) / (1.0 + WHITE)
+        assert abs(fit.slope_DN[place] - slope) < 4.0 * fit.slope_sd_DN[place] < 0.1 * slope
+    assert fit.chi_square < 1.6 * fit.degrees
+
+
 def test_few_electrons_a_photon_are_white_noise_and_no_tail_of_the_spread():
     """Two a photon, as where a lens looks at the screen: sixteen standard deviations from what other panels have."""
     spread, white = Spread(sigma_px=0.8), 0.5

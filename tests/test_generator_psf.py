@@ -120,6 +120,49 @@ def test_a_layers_tail_is_diffusion_with_absorption_at_a_distance(absorption, fr
 
 
 @pytest.mark.parametrize("model", PSF_MODELS)
+@pytest.mark.parametrize("axes", ["row", "column"])
+def test_light_of_a_line_camera_spreads_along_its_lines_alone(model, axes):
+    sigma = 0.6
+    spread = Spread(model=model, sigma_px=sigma, axes=axes)
+    half = noise_autocovariance_1d(model, sigma, 3)
+    expected = np.zeros((7, 7))
+    expected[3] = np.concatenate([half[:0:-1], half])
+    expected = expected if axes == "column" else expected.T
+    np.testing.assert_allclose(spread.noise_autocovariance(3), expected, atol=1e-6)
+    assert spread.variance_share == pytest.approx(half[0], rel=1e-6)
+    across = np.linspace(0.0, 0.5, 5)
+    along = spread.transfer(*((across, np.zeros(5)) if axes == "row" else (np.zeros(5), across)))
+    same = spread.transfer(*((np.zeros(5), across) if axes == "row" else (across, np.zeros(5))))
+    assert np.all(np.diff(along) < 0)
+    assert same == pytest.approx(np.ones(5))
+
+
+def test_the_noise_of_a_line_with_a_tail_is_that_of_quanta_that_land_anywhere():
+    """Monte Carlo: each photon spreads a part of its light as exp(-|x| / L) along a line of pixels."""
+    rng = np.random.default_rng(4)
+    share, reach, pixels, photons = 0.4, 0.9, 4000, 400_000
+    position = rng.uniform(0, pixels, photons)
+    left = np.floor(position).astype(int)
+
+    def tail_below(x):
+        return np.where(x < 0, 0.5 * np.exp(np.minimum(x, 0) / reach), 1.0 - 0.5 * np.exp(-np.maximum(x, 0) / reach))
+
+    def below(x):
+        return (1.0 - share) * norm.cdf(x / 0.3) + share * tail_below(x)
+
+    light = np.zeros(pixels + 20)
+    for step in range(-9, 10):
+        edge = left + step
+        np.add.at(light, edge + 10, below(edge + 1 - position) - below(edge - position))
+    inner = light[20:-20] - photons / pixels
+    # 1 / (1 + (2 pi L f)^2) is the transform of exp(-|x| / L) / (2 L)
+    found = Spread(sigma_px=0.3, tail_share=share, tail_px=reach, axes="column").noise_autocovariance(3)[3, 3:]
+    for lag, expected in enumerate(found):
+        measured = np.mean(inner[: len(inner) - lag] * inner[lag:]) / (photons / pixels)
+        assert measured == pytest.approx(expected, abs=4 * math.sqrt(2 * 1.5 / len(inner)))
+
+
+@pytest.mark.parametrize("model", PSF_MODELS)
 def test_no_spread_leaves_white_noise_and_sharp_signal(model):
     assert noise_autocovariance_1d(model, 0.0, 3).tolist() == [1.0, 0.0, 0.0, 0.0]
     assert blur_variance_share(model, 0.0) == 1.0

@@ -353,6 +353,9 @@ def test_the_general_noise_pattern_of_an_unchanged_spread_is_the_calibrated_one(
             half = noise_autocovariance_1d(model, sigma, 3)
             assert found.share == pytest.approx(half[0] ** 2, rel=1e-6)
             np.testing.assert_allclose(found.autocovariance, np.outer(half, half) / half[0] ** 2, atol=1e-6)
+            line = noise_pattern(Spread(model=model, sigma_px=sigma, axes="column"), state)
+            assert line.share == pytest.approx(half[0], rel=1e-6)
+            np.testing.assert_allclose(line.autocovariance, np.outer([1, 0, 0, 0], half) / half[0], atol=1e-6)
 
 
 def moments(frames, expected):

@@ -151,7 +151,7 @@ def test_a_twin_comes_back_from_its_file_as_it_was(tmp_path, twin, with_spectrum
     other = Spread(sigma_px=0.4, aspect=1.1, tail_share=0.2, tail_px=1.5, tail_order=1.5)
     tailed = replace(
         gaussian_spread("aperture", estimate_from_sd(0.4, 0.01)),
-        value=Spread(sigma_px=0.4, tail_share=0.3, tail_px=2.0, tail_order=0.0, absorption_per_px=0.2),
+        value=Spread(sigma_px=0.4, tail_share=0.3, tail_px=2.0, tail_order=0.0, absorption_per_px=0.2, axes="row"),
         others=(OtherSpread(family="two widths with an exponential tail", probability=0.2, value=other),),
     )
     written = replace(written, noise=replace(written.noise, spread=tailed))
@@ -160,11 +160,12 @@ def test_a_twin_comes_back_from_its_file_as_it_was(tmp_path, twin, with_spectrum
     assert [path.name for path in tmp_path.iterdir()] == ["twin.h5"]
 
 
-def test_a_file_from_before_layers_that_absorb_has_a_clear_one(tmp_path, twin):
+def test_a_file_from_before_layers_that_absorb_and_line_cameras_has_none_of_them(tmp_path, twin):
     layer = Spread(sigma_px=0.4, tail_share=0.3, tail_px=2.0, tail_order=0.0)
     spread = replace(gaussian_spread("aperture", estimate_from_sd(0.4, 0.01)), value=layer)
     write_twin(tmp_path / "twin.h5", replace(twin, noise=replace(twin.noise, spread=spread)))
-    damage(tmp_path / "twin.h5", lambda file: file["noise"].attrs.__delitem__("absorption_per_px"))
+    for name in ("absorption_per_px", "spread_axes"):
+        damage(tmp_path / "twin.h5", lambda file, name=name: file["noise"].attrs.__delitem__(name))
     assert read_twin(tmp_path / "twin.h5").noise.spread.value == layer
 
 
@@ -225,6 +226,10 @@ DAMAGES = {
     "a layer that gives light": (
         lambda file: file["noise"].attrs.update(absorption_per_px=-0.5),
         "absorption_per_px of the optical spread: got -0.5; expected 0 to 1000",
+    ),
+    "a spread along no axis": (
+        lambda file: file["noise"].attrs.update(spread_axes="depth"),
+        "axes of the optical spread: got depth; expected one of both, row, column",
     ),
     "another spread of no shape": (
         lambda file: file["noise"].attrs.update(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...acquisition.binned_frames import means_of_bins
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.line.twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, Twin, gaussian_spread
-from ...generator.spread.psf import blur_variance_share
+from ...generator.spread.psf import Spread, blur_variance_share
 
 _MODEL = "sampled"
 _WIDEST = 8.0  # bins that light may spread over
@@ -69,14 +69,21 @@ def _noise(noise: NoiseModel, factor: int) -> NoiseModel:
     """Noise of the squares, whose rounding is part of the electronic one."""
     read_DN = noise.read_noise_DN.value
     rounded = math.sqrt(noise.read_variance_DN2) / read_DN if read_DN > 0.0 else 1.0
-    width = _width_that_leaves(noise.spread.value.binned_variance_share(factor))
-    ends = sorted(_width_that_leaves(spread.binned_variance_share(factor)) for spread in noise.spread.ends())
+    axes = noise.spread.value.axes
+
+    def width_of(spread: Spread) -> float:
+        """Of a Gaussian along both axes, which leaves the square of what it leaves along one."""
+        share = spread.binned_variance_share(factor)
+        return _width_that_leaves(share if axes == "both" else share**2)
+
+    width = width_of(noise.spread.value)
+    ends = sorted(width_of(spread) for spread in noise.spread.ends())
     sigma = Estimate(value=width, low=min(ends[0], width), high=max(ends[1], width))
     read = noise.read_noise_DN.times(rounded / factor)
     if read_DN == 0.0 and noise.quantised:
         alone = math.sqrt(noise.read_variance_DN2) / factor
         read = Estimate(value=alone, low=alone, high=alone)
-    return replace(noise, spread=gaussian_spread(_MODEL, sigma), read_noise_DN=read, quantised=False)
+    return replace(noise, spread=gaussian_spread(_MODEL, sigma, axes=axes), read_noise_DN=read, quantised=False)
 
 
 def _width_that_leaves(share: float) -> float:

@@ -107,18 +107,21 @@ def noise_pattern(spread: Spread, state: LineState) -> NoisePattern:
     power = spread.noise_power(_GRID)
     aliases = 0 if spread.model == "sampled" else 2 if spread.sigma_px > 0.4 and spread.tail_share == 0 else 4
     order = np.arange(-aliases, aliases + 1)
-    every = (frequency[:, None] + order).ravel()
-    f_row, f_column = every[:, None], every[None, :]
+
+    def aliased(axis: str) -> FloatArray:
+        """Frequencies along an axis with their aliases; 0 where it counts lines, which share no light."""
+        return (frequency[:, None] + order).ravel() if spread.axes in ("both", axis) else np.zeros(frequency.size)
+
+    rows, columns = aliased("row"), aliased("column")
+    f_row, f_column = rows[:, None], columns[None, :]
     before = spread.transfer(f_row, f_column)
     change = optical_transfer(state, spread, f_row, f_column) ** 2
     for factor in state.power_transfers:
         change = change * factor(f_row, f_column)
     change = change - before**2
     if aliases:
-        collected = np.sinc(every) ** 2
-        change = change * collected[:, None] * collected[None, :]
-        count = order.size
-        change = change.reshape(frequency.size, count, frequency.size, count).sum(axis=(1, 3))
+        change = change * np.sinc(f_row) ** 2 * np.sinc(f_column) ** 2
+        change = change.reshape(frequency.size, -1, frequency.size, columns.size // frequency.size).sum(axis=(1, 3))
     power = np.maximum(power + change, 0.0)
     whole = whole_spectrum(power)
     covariance = np.fft.ifft2(whole).real

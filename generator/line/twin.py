@@ -171,10 +171,10 @@ class SpreadEstimate:
         )
 
 
-def gaussian_spread(model: str, sigma_px: Estimate) -> SpreadEstimate:
-    """A Gaussian spread, alike along rows and columns, of a width with its interval, px."""
+def gaussian_spread(model: str, sigma_px: Estimate, *, axes: str = "both") -> SpreadEstimate:
+    """A Gaussian spread, as wide along all `axes`, of a width with its interval, px."""
     return SpreadEstimate(
-        value=Spread(model=model, sigma_px=sigma_px.value),
+        value=Spread(model=model, sigma_px=sigma_px.value, axes=axes),
         family=f"Gaussian ({model})",
         intervals={"sigma_px": sigma_px},
     )

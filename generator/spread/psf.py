@@ -9,7 +9,7 @@ screens, 3/2 for light that falls off as exp(-r / L). Order 0 stands for a layer
 distance L from the pixels: exp(-L (sqrt((2 pi)^2 q + k^2) - k)), k the inverse of the length over which it is absorbed. Without
 absorption that is light which falls off as (r^2 + L^2)^(-3/2), of a point behind a clear layer; with it as exp(-k r) far away.
 a: width along rows over width along columns. With w = 0 and a = 1 it is the Gaussian of most simulators, which factors into two
-axes.
+axes. A line camera takes its lines one after another, so that no light gets from one to the next: f across the lines is 0 then.
 
 Two descriptions of how quanta meet pixels exist in the field, and below one pixel they differ:
 
@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 
 PSF_MODELS = ("aperture", "sampled")
+AXES = ("both", "row", "column")  # index along which light spreads; one where the other counts lines of a line camera
 LAYER = 0.0  # order of the tail that a layer makes
 FloatArray = NDArray[np.float64]
 _GRID = 64  # cells of the noise power spectrum per axis
@@ -43,8 +44,9 @@ _ALIASES = 3  # spectra on either side that a tail and a pixel's aperture still 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
-    """The optical spread: `model` (`aperture` or `sampled`), sigma_px, aspect, tail_share, tail_px, tail_order and
-    absorption_per_px, which only a layer's tail has (see the module).
+    """The optical spread: `model` (`aperture` or `sampled`), sigma_px, aspect, tail_share, tail_px, tail_order,
+    absorption_per_px, which only a layer's tail has (see the module), and axes (`both`; `row` or `column`: the index along
+    which light spreads, where the other counts lines that were taken one after another).
 
     Example:
         >>> Spread(sigma_px=0.5).variance_share < Spread(sigma_px=0.3).variance_share
@@ -58,9 +60,12 @@ class Spread:
     tail_px: float = 1.0
     tail_order: float = 1.0
     absorption_per_px: float = 0.0
+    axes: str = "both"
 
     def __post_init__(self) -> None:
         _check(self.model, self.sigma_px)
+        if self.axes not in AXES:
+            raise InputError("axes of the optical spread", received=self.axes, expected="one of " + ", ".join(AXES))
         bounds = {
             "aspect": (0.1, 10.0),
             "tail_share": (0.0, 1.0),
@@ -79,7 +84,7 @@ class Spread:
     @property
     def separable(self) -> bool:
         """Whether it is one Gaussian, alike along both axes, so that kernels factor into one per axis."""
-        return self.aspect == 1.0 and self.tail_share == 0.0
+        return self.aspect == 1.0 and self.tail_share == 0.0 and self.axes == "both"
 
     @property
     def reach_px(self) -> int:
@@ -89,6 +94,10 @@ class Spread:
 
     def transfer(self, f_row: FloatArray, f_column: FloatArray) -> FloatArray:
         """Transfer function, frequencies in cycles per pixel that broadcast; 1 at 0."""
+        if self.axes != "both":
+            f_row, f_column = (
+                f if self.axes == axis else np.zeros_like(f) for f, axis in ((f_row, "row"), (f_column, "column"))
+            )
         if self.separable:
             return np.asarray(
                 base_transfer_1d(self.model, self.sigma_px, f_row)
@@ -167,6 +176,9 @@ def _tail_transfer(spread: Spread, square: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _noise_power(spread: Spread, cells: int) -> FloatArray:
+    if spread.axes != "both":
+        line = np.broadcast_to(_power_of_line(spread, cells), (cells // 2 + 1, cells // 2 + 1))
+        return line if spread.axes == "column" else line.T
     widths = (spread.sigma_px * math.sqrt(spread.aspect), spread.sigma_px / math.sqrt(spread.aspect))
     rows, columns = (_power_of_gaussian(spread.model, float(width), cells) for width in widths)
     power = np.outer(rows, columns)
@@ -181,6 +193,21 @@ def _noise_power(spread: Spread, cells: int) -> FloatArray:
         power = core**2 * power + 2.0 * core * tail * of_both + tail**2 * of_tail
     power.flags.writeable = False
     return power
+
+
+def _power_of_line(spread: Spread, cells: int) -> FloatArray:
+    """Power of unit quanta whose light spreads along one axis, at 0 .. 1/2 of it (cells/2 + 1,)."""
+    width = spread.sigma_px * (math.sqrt(spread.aspect) if spread.axes == "row" else 1.0 / math.sqrt(spread.aspect))
+    power = _power_of_gaussian(spread.model, width, cells)
+    if spread.tail_share == 0.0:
+        return power
+    core, tail = 1.0 - spread.tail_share, spread.tail_share
+    every = _aliases(spread.model, cells)
+    of_core = base_transfer_1d(spread.model, width, every)
+    of_tail = _tail_transfer(spread, every**2 * (spread.aspect if spread.axes == "row" else 1.0 / spread.aspect))
+    collected = np.sinc(every) ** 2 if spread.model == "aperture" else np.ones_like(every)
+    with_tail = collected * tail * of_tail * (2.0 * core * of_core + tail * of_tail)
+    return np.asarray(core**2 * power + with_tail.reshape(len(power), -1).sum(axis=1))
 
 
 @lru_cache(maxsize=8)

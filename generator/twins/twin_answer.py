@@ -21,6 +21,7 @@ def spread_answer(spread: SpreadEstimate) -> dict[str, Any]:
     return {
         "family": spread.family,
         "model": value.model,
+        "axes": value.axes,
         **{
             name: (spread.intervals[name].as_dict() if name in spread.intervals else getattr(value, name))
             for name in ("sigma_px", "aspect", "tail_share", "tail_px", "tail_order", "absorption_per_px")

@@ -126,6 +126,7 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
         noise = file.create_group("noise")
         spread = twin.noise.spread
         noise.attrs["psf_model"] = spread.value.model
+        noise.attrs["spread_axes"] = spread.value.axes
         noise.attrs["spread_family"] = spread.family
         noise.attrs["spread_others"] = json.dumps([asdict(item) for item in spread.others])
         for name in _SHAPE_OF_SPREAD:
@@ -338,18 +339,20 @@ def _spread(noise: Any, path: object) -> SpreadEstimate:
     model = _text(noise.attrs["psf_model"])
     if "tail_share" not in noise.attrs:
         return gaussian_spread(model, sigma)
-    none = {"absorption_per_px": 0.0}  # files from before layers that absorb
+    # files from before layers that absorb and line cameras
+    none = {"absorption_per_px": 0.0, "axes": "both"}
     shape = {name: float({**none, **noise.attrs}[name]) for name in _SHAPE_OF_SPREAD}
+    axes = _text(noise.attrs.get("spread_axes", "both"))
     found = {name: _get_estimate(noise, f"{name}_interval") for name in shape}
     return SpreadEstimate(
-        value=Spread(model=model, sigma_px=sigma.value, **shape),
+        value=Spread(model=model, sigma_px=sigma.value, axes=axes, **shape),
         family=_text(noise.attrs["spread_family"]),
         intervals={"sigma_px": sigma} | {name: known for name, known in found.items() if known is not None},
         others=tuple(
             OtherSpread(
                 family=str(item["family"]),
                 probability=float(item["probability"]),
-                value=Spread(**{name: (none | item["value"])[name] for name in ("model", "sigma_px", *shape)}),
+                value=Spread(**{name: (none | item["value"])[name] for name in ("model", "sigma_px", "axes", *shape)}),
             )
             for item in json.loads(_text(noise.attrs.get("spread_others", "[]")))
         ),

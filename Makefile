@@ -58,8 +58,9 @@ lock: $(READY)
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/python -m uv pip compile --quiet --universal --python-version 3.11 --no-header --no-annotate --extra explore --extra fits --extra dicom --extra fabio --extra meshes --extra zarr pyproject.toml -o requirements.lock
 
+# `check` has run tests/test_house.py
 test: $(READY) check
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m 'not slow and not browser'
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m 'not slow and not browser' --ignore=tests/test_house.py
 
 # the page of `raytwin explore` and the pages of results in Debian's Chromium (apt-get install chromium), some minutes;
 # after `make demo` the demo's page too

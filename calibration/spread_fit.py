@@ -160,26 +160,37 @@ class _Candidate:
 _OfReaches = list[tuple[float, _Candidate]]  # a family at reaches of the tail, each with its share of all reaches
 
 
-@lru_cache(maxsize=16)
-def _cells(side: int) -> tuple[FloatArray, FloatArray]:
-    """Means over cells of frequencies (cell, bin in use), and each cell's share of the modes (cell,).
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cells:
+    """Cells of frequencies: bins are single up to six and wider by a fifth from there.
 
-    Bins are single up to six and wider by a fifth from there: the power of a spread hardly changes inside a cell, and the fit
-    has a tenth of the numbers.
+    The power of a spread hardly changes inside a cell, and the fit has a tenth of the numbers.
+
+    Fields: bins (bin,): places of those in use in a flattened power; cell (bin,): which each is in; weight (bin,): its share of
+    the cell's modes; share (cell,): of the modes in use.
     """
-    half = side // 2
-    order = np.arange(half + 1)
-    line = np.where(order <= 6, order, 6 + np.floor(np.log(np.maximum(order, 6) / 6.0) / math.log(1.2) + 1e-9)).astype(
-        int
-    )
-    used = usable(side)
-    label = (line[:, None] * (line[-1] + 1) + line[None, :])[used]
-    weight = mode_share(side)[used]
-    found, place = np.unique(label, return_inverse=True)
-    means = np.zeros((found.size, label.size))
-    means[place, np.arange(label.size)] = weight
-    share = means.sum(axis=1)
-    return means / share[:, None], share / share.sum()
+
+    bins: NDArray[np.intp]
+    cell: NDArray[np.intp]
+    weight: FloatArray
+    share: FloatArray
+
+    def means(self, power: FloatArray) -> FloatArray:
+        """Means over cells (cell,) of a power (K + 1, K + 1)."""
+        return np.asarray(np.bincount(self.cell, self.weight * power.ravel()[self.bins]), dtype=np.float64)
+
+
+@lru_cache(maxsize=16)
+def _cells(side: int) -> _Cells:
+    """Those of squares of a side, px."""
+    order = np.arange(side // 2 + 1)
+    wider = 6 + np.floor(np.log(np.maximum(order, 6) / 6.0) / math.log(1.2) + 1e-9)
+    line = np.where(order <= 6, order, wider).astype(np.intp)
+    bins = np.flatnonzero(usable(side))
+    _, cell = np.unique((line[:, None] * (line[-1] + 1) + line[None, :]).ravel()[bins], return_inverse=True)
+    modes = mode_share(side).ravel()[bins]
+    together = np.bincount(cell, modes)
+    return _Cells(bins, cell, modes / together[cell], together / together.sum())
 
 
 @dataclass(slots=True)
@@ -306,11 +317,11 @@ class _Problem:
         self.modes: list[FloatArray] = []
         self.independent = 0.0  # bins are correlated: so many of them would be independent
         for item in series:
-            means, share = _cells(item.square_px)
-            self.data.append(means @ item.power_DN2[item.used])
-            self.modes.append(share * item.modes.sum())
+            layout = _cells(item.square_px)
+            self.data.append(layout.means(item.power_DN2))
+            self.modes.append(layout.share * item.modes.sum())
             # cells of one bin scatter as overlapping squares do, wide ones as their modes say
-            self.independent += float(np.sum(spread_of_bins(item.square_px) ** (1.0 / np.sum(means > 0, axis=1))))
+            self.independent += float(np.sum(spread_of_bins(item.square_px) ** (1.0 / np.bincount(layout.cell))))
         self.drifting = tuple(number for number, item in enumerate(series) if item.between_series)
         # standard deviation of the power of each series' slow changes, where others tell it
         self.slow_sd_DN2 = np.full(len(self.series), math.inf)
@@ -358,7 +369,7 @@ class _Problem:
 
     def read_in_cells(self, side: int) -> FloatArray:
         """Power of a unit of electronic noise (cell,)."""
-        return np.asarray(_cells(side)[0] @ self.electronic[side][usable(side)])
+        return _cells(side).means(self.electronic[side])
 
     def shapes(self, spread: Spread) -> dict[int, FloatArray]:
         """Power of unit quanta on each side's frequencies (K + 1, K + 1), as tapered squares show it."""
@@ -366,7 +377,7 @@ class _Problem:
 
     def in_cells(self, spread: Spread) -> dict[int, FloatArray]:
         """The same (cell,)."""
-        return {side: _cells(side)[0] @ shape[usable(side)] for side, shape in self.shapes(spread).items()}
+        return {side: _cells(side).means(shape) for side, shape in self.shapes(spread).items()}
 
     def normal(
         self,
@@ -552,7 +563,7 @@ def electronic_shape(darks: Sequence[NoisePower], side: int) -> FloatArray:
 @lru_cache(maxsize=16)
 def _slow_in_cells(side: int) -> FloatArray:
     """The power of slow changes (cell, change)."""
-    return np.asarray(_cells(side)[0] @ _slow(side)[:, usable(side)].T)
+    return np.stack([_cells(side).means(power) for power in _slow(side)], axis=1)
 
 
 @lru_cache(maxsize=16)

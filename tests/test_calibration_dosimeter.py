@@ -228,6 +228,7 @@ def test_repeats_tell_the_scatter_and_rounding_is_its_own(tmp_path):
     assert coarse.kermas[0].relative_sd == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_one_wrong_row_among_many_is_named_and_left_out(tmp_path):
     settings = [(kV, filters) for kV in (40, 50, 60, 80, 100) for filters in ("", "Al:2")]
     rows = [list(row) for row in dose_rows(settings)]
@@ -255,6 +256,7 @@ def test_a_reading_a_thousand_times_too_large_is_suspected_though_it_bends_the_f
     assert suspects(fit, data)[0].rows == (2,)
 
 
+@pytest.mark.slow
 def test_two_wild_readings_that_nobody_can_tell_widen_the_intervals(tmp_path):
     """One in five may be left out; a table that fits no spectrum all the same knows little."""
     rows = dose_rows(SETTINGS)

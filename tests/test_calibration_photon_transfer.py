@@ -225,6 +225,7 @@ def test_output_noise_from_frame_to_frame_is_named_with_its_size(tmp_path):
     assert is_gain(level.gain_DN)
 
 
+@pytest.mark.slow
 def test_a_nonlinear_detector_departs_from_the_line_in_load(tmp_path):
     def bend(frames, setting, rng):
         signal = frames - DARK_DN

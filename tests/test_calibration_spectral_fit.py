@@ -255,7 +255,7 @@ def test_labels_of_another_unit_are_named_and_bend_no_filtration(model, factor):
     assert filtration.value == pytest.approx(right.posterior.interval("inherent_filtration_mm_Al").value, abs=0.4)
 
 
-@pytest.mark.parametrize("wrong", ["filter", "exchanged"])
+@pytest.mark.parametrize("wrong", ["filter", pytest.param("exchanged", marks=pytest.mark.slow)])
 def test_levels_that_contradict_every_spectrum_leave_intervals_that_hold_the_truth(model, wrong):
     truth = typical(model, inherent_filtration_mm_Al=1.6)
     soft, bare, hard = levels_of(model, truth, BEAMS)
@@ -302,6 +302,7 @@ def test_a_wedge_at_one_kV_tells_what_levels_at_one_kV_do_not(model):
     assert abs(np.mean(after) - 0.6) < 3 * np.std(after)
 
 
+@pytest.mark.slow
 def test_levels_that_contradict_the_model_raise_the_learned_discrepancy(model):
     beams = [OpenBeam(kV=kV, filters=filters_from_text(text)) for kV in (40.0, 60.0, 90.0) for text in ("", "Cu:0.05")]
     truth = typical(model)

@@ -668,6 +668,7 @@ def score_pairless(result):
     return compute_scores([item for item in result.outcomes if item.label != "pair"], tuple(EFFECTS))
 
 
+@pytest.mark.slow
 def test_baselines_that_learn_beat_the_commonest_and_are_not_the_diagnosis(many):
     _, result = many
     baselines = result.scores["baselines"]

@@ -184,6 +184,7 @@ def stand_in(monkeypatch):
     return limits, trained
 
 
+@pytest.mark.slow
 def test_task_tries_twins_that_differ_by_the_effect_and_measured_images_on_the_same_objects(
     line, twin, tmp_path, stand_in, monkeypatch
 ):

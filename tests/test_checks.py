@@ -81,8 +81,9 @@ def test_a_good_session_is_not_suspected_and_its_series_serve(session):
     assert len(repr(result).splitlines()) <= 20
 
 
-def test_stuck_and_wildly_noisy_pixels_make_no_flat_saturated_and_no_scene_change(broken, tmp_path):
-    """Both show in the darks, and no panel is without them; a flat that saturates is told all the same."""
+@pytest.fixture
+def panel_of_bad_pixels(broken, tmp_path):
+    """A session with pixels stuck at full scale and wildly noisy ones, and one flat that saturates."""
     rng = np.random.default_rng(8)
     stuck, noisy = np.zeros((2, *broken.SHAPE), dtype=bool)
     stuck.flat[rng.choice(stuck.size, 12, replace=False)] = True
@@ -94,12 +95,19 @@ def test_stuck_and_wildly_noisy_pixels_make_no_flat_saturated_and_no_scene_chang
             frames[:, 40:60, 40:60] = broken.FULL_DN
         frames = np.where(stuck, broken.FULL_DN, np.clip(np.rint(frames), 0, broken.FULL_DN))
         series.append(replace(one, frames=frames.astype(np.uint16)))
-    path = tmp_path / "session.h5"
-    broken.write(path, series)
-    found = [(finding.code, finding.series) for finding in check_acquisition(path).findings]
+    broken.write(tmp_path / "session.h5", series)
+    return tmp_path / "session.h5"
+
+
+def test_stuck_and_wildly_noisy_pixels_make_no_flat_saturated_and_no_scene_change(broken, panel_of_bad_pixels):
+    """Both show in the darks, and no panel is without them; a flat that saturates is told all the same."""
+    found = [(finding.code, finding.series) for finding in check_acquisition(panel_of_bad_pixels).findings]
     assert found == [(FindingCode.SATURATED, broken.BRIGHT)]
-    # calibration leaves out the one that saturates and takes the others for what they are
-    twin = calibrate(path)
+
+
+@pytest.mark.slow
+def test_calibration_leaves_out_the_flat_that_saturates_and_not_those_with_stuck_pixels(broken, panel_of_bad_pixels):
+    twin = calibrate(panel_of_bad_pixels)
     assert [line for line in twin.warnings if "left out" in line] == [
         f"left out of the fit: {broken.BRIGHT} (saturated at {broken.FULL_DN} DN)"
     ]

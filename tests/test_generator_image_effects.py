@@ -367,7 +367,7 @@ def test_a_bent_response_that_was_always_there_is_not_bent_twice(series_line, re
     np.testing.assert_allclose(model.image_effects.flat_DN, model.open_signal_DN, rtol=1e-9)
 
 
-@pytest.mark.parametrize("effect", ["filtration_error", "kv_error"])
+@pytest.mark.parametrize("effect", [pytest.param("filtration_error", marks=pytest.mark.slow), "kv_error"])
 def test_a_beam_that_changed_after_calibration_hardens_references_as_the_model_says(series_line, references, effect):
     strength = 0.6 if effect == "filtration_error" else 4.0
     twin = with_effect(series_line, effect, strength=strength)

@@ -127,6 +127,7 @@ def test_the_command_prints_the_truth_as_json(tmp_path, capsys):
     assert "s.truth.json: the truth" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_command_plants_effects_and_names_them_in_the_truth(tmp_path, capsys):
     words = ["lab", "-o", str(tmp_path / "s.h5"), "--protocol", "short", "--seed", "4", "--size", "48", "--frames", "4"]
     words += ["--products", "1", "--geometry", "coarse", "--leave-out", "high_kV", "--family", "none", "--json"]

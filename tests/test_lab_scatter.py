@@ -94,7 +94,12 @@ def single_scatter_of_water(thickness_mm, system, *, keV=KEV):
 
 
 @pytest.mark.parametrize(
-    ("thickness_mm", "gap_mm"), [pytest.param(2.0, 350.0, marks=pytest.mark.slow), (20.0, 350.0), (20.0, 100.0)]
+    ("thickness_mm", "gap_mm"),
+    [
+        pytest.param(2.0, 350.0, marks=pytest.mark.slow),
+        pytest.param(20.0, 350.0, marks=pytest.mark.slow),
+        (20.0, 100.0),
+    ],
 )
 def test_single_scatter_of_a_slab_is_its_integral(thickness_mm, gap_mm):
     system = replace(SYSTEM, source_object_mm=1000.0 - gap_mm)

@@ -39,6 +39,7 @@ def frames_by_name(path):
         return {series.name: series.read_frames() for series in session.series}
 
 
+@pytest.mark.slow
 def test_a_full_session_holds_the_measurement_set_that_splits_every_pair(full):
     path, truth = full
     with open_acquisition(path) as session:

@@ -737,6 +737,7 @@ def test_a_folder_that_is_none_of_ours_is_refused(content, message, tmp_path):
     assert message in str(error.value)
 
 
+@pytest.mark.slow
 def test_networks_trained_by_two_processes_are_those_of_one_to_the_byte(dataset_file, tmp_path):
     recipe = dataclasses.replace(starter_recipe(), steps=None, epochs=1, batch=2)
     words = {"recipe": recipe, "networks": 3, "seed": 5, "start_from": "starter"}

@@ -35,7 +35,7 @@ def test_patches_are_cut_on_a_grid(classifiers):
     np.testing.assert_array_equal(patches[1, 4, 0], images[1, 0, 8:16, 8:16])
 
 
-@pytest.mark.parametrize("way", ["statistics", "network"])
+@pytest.mark.parametrize("way", ["statistics", pytest.param("network", marks=pytest.mark.slow)])
 def test_classifiers_see_a_change_of_texture_and_nothing_where_there_is_none(classifiers, way):
     rng = np.random.default_rng(2)
 

@@ -171,7 +171,10 @@ def _tail_transfer(spread: Spread, square: FloatArray) -> FloatArray:
     if spread.tail_order == LAYER:
         absorbed = spread.absorption_per_px * spread.tail_px
         return np.asarray(np.exp(absorbed - np.sqrt(reach**2 * square + absorbed**2)))
-    return np.asarray((1.0 + reach**2 * square) ** -spread.tail_order)
+    fallen = 1.0 + reach**2 * square
+    if spread.tail_order == 1.5:
+        return np.asarray(1.0 / (fallen * np.sqrt(fallen)))  # a general power takes several times as long
+    return np.asarray(fallen**-spread.tail_order)
 
 
 @lru_cache(maxsize=64)
@@ -179,20 +182,35 @@ def _noise_power(spread: Spread, cells: int) -> FloatArray:
     if spread.axes != "both":
         line = np.broadcast_to(_power_of_line(spread, cells), (cells // 2 + 1, cells // 2 + 1))
         return line if spread.axes == "column" else line.T
-    widths = (spread.sigma_px * math.sqrt(spread.aspect), spread.sigma_px / math.sqrt(spread.aspect))
-    rows, columns = (_power_of_gaussian(spread.model, float(width), cells) for width in widths)
-    power = np.outer(rows, columns)
+    of_core, of_both, of_tail = _parts_of_power(
+        replace(spread, tail_share=1.0 if spread.tail_share > 0.0 else 0.0), cells
+    )
+    power = of_core
     if spread.tail_share > 0.0:
         core, tail = 1.0 - spread.tail_share, spread.tail_share
-        # a core of no width and a share of 1: what other cores and shares have in common
-        light, of_tail = _light_of_tail(replace(spread, sigma_px=0.0, tail_share=1.0), cells)
-        along_rows, along_columns = (
-            base_transfer_1d(spread.model, width, _aliases(spread.model, cells)) for width in widths
-        )
-        of_both = _folded(along_rows[:, None] * light * along_columns[None, :], cells)
-        power = core**2 * power + 2.0 * core * tail * of_both + tail**2 * of_tail
+        power = core**2 * of_core + 2.0 * core * tail * of_both + tail**2 * of_tail
     power.flags.writeable = False
     return power
+
+
+@lru_cache(maxsize=64)
+def _parts_of_power(spread: Spread, cells: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Power of the core, of core and tail together, and of the tail (cells/2 + 1, cells/2 + 1), which any share of the tail has in
+    common; of a spread without a tail the core's alone, three times."""
+    widths = (spread.sigma_px * math.sqrt(spread.aspect), spread.sigma_px / math.sqrt(spread.aspect))
+    of_core = np.outer(*(_power_of_gaussian(spread.model, float(width), cells) for width in widths))
+    if spread.tail_share == 0.0:
+        return of_core, of_core, of_core
+    # a core of no width: what other cores have in common
+    light, of_tail = _light_of_tail(replace(spread, sigma_px=0.0), cells)
+    along_rows, along_columns = (
+        base_transfer_1d(spread.model, width, _aliases(spread.model, cells)) for width in widths
+    )
+    kept = cells // 2 + 1
+    # the sum over aliases as in `_folded`, one axis after the other
+    folded = np.einsum("fka,ka->fk", light.reshape(len(light), kept, -1), along_columns.reshape(kept, -1))
+    of_both = np.einsum("kaf,ka->kf", folded.reshape(kept, -1, kept), along_rows.reshape(kept, -1))
+    return of_core, of_both, of_tail
 
 
 def _power_of_line(spread: Spread, cells: int) -> FloatArray:
@@ -233,11 +251,14 @@ def _folded(power: FloatArray, cells: int) -> FloatArray:
     return np.asarray(power.reshape(kept, len(power) // kept, kept, -1).sum(axis=(1, 3)))
 
 
+@lru_cache(maxsize=256)
 def _power_of_gaussian(model: str, sigma_px: float, cells: int) -> FloatArray:
     """Power of unit quanta after a Gaussian spread at 0 .. 1/2 (cells/2 + 1,), one axis."""
     half = noise_autocovariance_1d(model, sigma_px, cells // 2)
     # where a wide spread leaves nothing, rounding and the end of the lags leave -1e-16 (2 px) to -3e-6 (5 px)
-    return np.asarray(np.maximum(np.fft.fft(np.concatenate([half, half[-2:0:-1]])).real[: half.size], 0.0))
+    power = np.maximum(np.fft.fft(np.concatenate([half, half[-2:0:-1]])).real[: half.size], 0.0)
+    power.flags.writeable = False
+    return power
 
 
 def whole_spectrum(quadrant: FloatArray) -> FloatArray:

@@ -52,8 +52,10 @@ _BOUNDS = {
 }
 # Of a core wider than this share of the square less than a fifth of the power is left there: it cannot be told from drift.
 _WIDEST_CORE = 0.1
-# narrow and wide, and of the tail little, much and nearly all
+# None at all, narrow and wide, and of the tail little, much and nearly all. White noise is as well explained by much of a white part
+# behind a wide spread: the prior makes that hundreds of times less likely, but a descent does not cross to the other.
 _STARTS = (
+    {"sigma_px2": 0.0, "log_aspect": 0.0, "tail_share": 0.0, "log_tail_px": 0.0},
     {"sigma_px2": 0.25, "log_aspect": 0.0, "tail_share": 0.05, "log_tail_px": 0.0},
     {"sigma_px2": 4.0, "log_aspect": 0.0, "tail_share": 0.2, "log_tail_px": 0.0},
     {"sigma_px2": 0.25, "log_aspect": 0.0, "tail_share": 0.8, "log_tail_px": 0.0},

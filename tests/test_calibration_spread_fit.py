@@ -110,6 +110,22 @@ def test_a_line_camera_s_noise_is_that_of_its_lines():
     assert fit.chi_square < 1.6 * fit.degrees
 
 
+@pytest.mark.parametrize("seed", [3, 6])
+def test_counts_without_any_spread_are_no_white_part_behind_a_wide_one(seed):
+    rng, beams = np.random.default_rng(seed), (0, 0, 0, 1, 2, 2)
+    signals = (2000.0, 4000.0, 8000.0, 1900.0, 3000.0, 6000.0)
+    counts = [
+        compute_noise_power(
+            [rng.poisson(signal, (12, *SHAPE)).astype(float)], signal_DN=np.full(SHAPE, signal), good=GOOD
+        )
+        for signal in signals
+    ]
+    fit = fit_spread(counts, group=beams, most_read_DN2=0.0)
+    assert np.all(np.abs(fit.gain_DN - 1.0) < 3.0 * fit.gain_sd_DN) and fit.gain_sd_DN.max() < 0.1
+    assert fit.spread.variance_share > 0.9
+    assert np.all(fit.white_fraction < 0.1)
+
+
 def test_few_electrons_a_photon_are_white_noise_and_no_tail_of_the_spread():
     """Two a photon, as where a lens looks at the screen: sixteen standard deviations from what other panels have."""
     spread, white = Spread(sigma_px=0.8), 0.5

@@ -22,6 +22,7 @@ from .hit_miss import PodFit, trusted_bound
 from .likelihood import Curve
 from .links import LINKS
 from .mixed import fit_mixed
+from .models import compare_models, with_links_open
 from .repeats import fit_trials
 from .robust import bread, clustered_curve, clustered_meat, clustered_total, score_rows
 from .solver import fit_batch
@@ -105,6 +106,7 @@ def compare_pod(
     size_margin: float | None = None,
     shared_images: bool = False,
     shared_networks: bool = False,
+    link_named: bool = True,
 ) -> Comparison:
     """Compare the a90 of two tables of trials; sizes in the tables' unit.
 
@@ -117,6 +119,7 @@ def compare_pod(
         margin: m of the equivalence test, as a share of a90 (0.1: within some 10 %).
         size_margin: also a test of the difference at this margin, in the tables' unit.
         shared_images, shared_networks: whether the same images and networks stand in both (the comparison is paired).
+        link_named: the link is meant; else bounds are those of all curves that fit, where another one fits a table better.
 
     Raises:
         InputError: a margin that is no share above 0 and below 1.
@@ -142,6 +145,13 @@ def compare_pod(
             else fit_trials(_compressed(table), link=link, log_size=log_size, method=method, repeats=repeats)
             for table, fit in zip((first, second), fits, strict=True)
         )
+    if not link_named:
+        opened = [
+            with_links_open(fit, compare_models(table), named=False)
+            for fit, table in zip(fits, (first, second), strict=True)
+        ]
+        notes += [f"{name}: {told}" for name, (*_, told) in zip(("first", "second"), opened, strict=True) if told]
+        fits = tuple(fit for fit, *_ in opened)
     pairs = [word for word, given in (("image", shared_images), ("network", shared_networks)) if given]
     paired = " and ".join(pairs) or "nothing"
     correlation, at_bound = 0.0, False

@@ -3,16 +3,19 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+
+_BY_CHANCE = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FalseAlarmRate:
     """Share of looks at products without object that ended in an alarm, with its 95 % interval.
 
-    effective_n: the number of independent looks that would be as informative (repeats count less).
+    effective_n: the number of independent looks that would be as informative (repeats count less); networks_differ: whether the
+    networks' rates differ by more than chance, so that the interval is that of other networks too.
     """
 
     n: int
@@ -21,6 +24,7 @@ class FalseAlarmRate:
     low: float
     high: float
     effective_n: float
+    networks_differ: bool = False
 
 
 def false_alarm_rate(
@@ -29,8 +33,10 @@ def false_alarm_rate(
     """False-alarm rate (0 to 1) with a 95 % interval.
 
     Clopper-Pearson on the effective number of looks, n V_binomial / V_clustered (never more than n), times (t(n - 1) / t(m))^2
-    for a variance known with m degrees of freedom, t Student's quantile at 97.5 %. V_clustered is by networks and images
-    (`robust.clustered_total`). Without repeats it is the exact binomial interval.
+    for a variance known with m degrees of freedom, t Student's quantile at 97.5 %. V_clustered is by images, and by networks too
+    where these differ by more than chance (Pearson's chi-square of their rates, at 5 %): else the interval is of the mean rate of
+    these networks, and few alarms tell no more (`robust.clustered_total`). Of no alarm, or alarms alone, each image is one look.
+    Without repeats it is the exact binomial interval.
     Source: Clopper & Pearson, Biometrika 26 (1934) 404; Korn & Graubard, Survey Methodology 24 (1998) 193.
 
     Args:
@@ -49,20 +55,34 @@ def false_alarm_rate(
     n, count = len(alarm), int(alarm.sum())
     rate = count / n
     effective = float(n)
-    groups = []
+    codes = {}
     for name, labels in (("network", network), ("image", image)):
         if labels is not None:
-            codes = codes_from_labels(name, labels, n)
-            if 0 < codes.max() < n - 1:
-                groups.append(codes)
+            code = codes_from_labels(name, labels, n)
+            if 0 < code.max() < n - 1:
+                codes[name] = code
+    differ = "network" in codes and 0 < count < n and _differ(alarm, codes["network"])
+    groups = [code for name, code in codes.items() if name == "image" or differ]
     if groups and 0 < count < n:
         variance, freedom = clustered_total(alarm - rate, groups)
         few = float(student_quantile(TWO_SIDED, n - 1) / student_quantile(TWO_SIDED, freedom)) ** 2
         effective = few * min(n, n * n * rate * (1 - rate) / max(variance, 1e-300))
     elif groups:
-        # none or all: the spread cannot be seen, so one look for each level of the smaller factor is what is sure
-        effective = float(min(int(codes.max()) + 1 for codes in groups))
+        effective = float(max(code.max() for code in groups) + 1)
     k, m = rate * effective, effective
     low = float(betaincinv(k, m - k + 1, 0.025)) if count else 0.0
     high = float(betaincinv(k + 1, m - k, 0.975)) if count < n else 1.0
-    return FalseAlarmRate(n=n, false_alarms=count, rate=rate, low=low, high=high, effective_n=effective)
+    return FalseAlarmRate(
+        n=n, false_alarms=count, rate=rate, low=low, high=high, effective_n=effective, networks_differ=differ
+    )
+
+
+def _differ(alarm: NDArray[np.float64], network: NDArray[np.intp]) -> bool:
+    """Whether networks' rates differ by more than one in twenty do by chance (Pearson's chi-square)."""
+    from scipy.special import chdtri
+
+    looks = np.bincount(network).astype(float)
+    expected = looks * alarm.mean()
+    square = (np.bincount(network, weights=alarm) - expected) ** 2
+    statistic = float(np.sum(square / (expected * (1.0 - alarm.mean()))))
+    return statistic > float(chdtri(len(looks) - 1, _BY_CHANCE))

@@ -114,17 +114,49 @@ def better_curve(found: tuple[Alternative, ...], fit: PodFit) -> Alternative | N
     return best if fit.aic > best.aic + _ALIKE else None
 
 
-def ends_below_90(curve: Alternative) -> bool:
+def with_links_open(
+    fit: PodFit, found: tuple[Alternative, ...], *, named: bool
+) -> tuple[PodFit, OverLinks | None, str | None]:
+    """A pooled fit beside all curves that were tried on the same trials.
+
+    Args:
+        fit: as `fit_pod` gives it.
+        found: as `compare_models` gives them.
+        named: whether the fit's link was asked for.
+
+    Returns:
+        The fit, its bounds as wide as those of all curves that fit where another one fits better and no link was asked for; those
+        curves joined; a warning where another one fits better. The fit as it came and two times None where looks repeat, hits and
+        misses separate or the fit is not the most likely one.
+    """
+    joined = over_links(found, link=fit.link, log_size=fit.log_size)
+    if fit.repeats != "pooled" or fit.method != "ml" or fit.separated or joined is None:
+        return fit, None, None
+    best = better_curve(found, fit)
+    if best is None:
+        return fit, joined, None
+    told = f"another curve fits better: {best.name} (AIC lower by {(fit.aic or 0.0) - (best.aic or 0.0):.3g}"
+    if not named and _ends_below_90(best):
+        told += "); it ends below 90 %, so there is no a90"
+    else:
+        told += f", a90 {'none' if best.a90 is None else f'{best.a90:.4g}'}); "
+        told += (
+            "bounds of all curves that fit stand in over_links" if named else "bounds are those of all curves that fit"
+        )
+    return fit if named else _widened(fit, joined, best), joined, told
+
+
+def _ends_below_90(curve: Alternative) -> bool:
     """Whether a curve has a ceiling of 90 % at most."""
     return curve.ceiling is not None and curve.ceiling <= 0.9
 
 
-def widened(fit: PodFit, joined: OverLinks, best: Alternative) -> PodFit:
+def _widened(fit: PodFit, joined: OverLinks, best: Alternative) -> PodFit:
     """A fit whose bounds on a90 reach as far as those of all curves together; None where one of these has none.
 
     best: the curve that fits better than this one. Where it ends below 90 %, there is no a90.
     """
-    if ends_below_90(best):
+    if _ends_below_90(best):
         without = replace(fit, a90=None, reaches_90=False)
         return replace(without, a90_95=NO_BOUNDS, a90_95_two_sided=NO_BOUNDS, a90_low_two_sided=NO_BOUNDS)
 

@@ -5,9 +5,10 @@ With an assumed curve and spread of networks and images, the expected covariance
 V = A^-1 B A^-1,  A = sum d^2 x x' / (m (1 - m)),  B = var of sum d x (hit - m) / (m (1 - m))
 
 with m the averaged POD and d its slope by eta; B holds the covariances of looks that share a network or an image, by
-quadrature. The expected bound follows from the spread of a90: a90_95 / a90 = exp(1.645 sd(ln a90)) (on the size's own
-scale 1 + 1.645 sd(a90) / a90). Without repeats it is the usual Fisher information.
-Validity: large-sample; below some 40 informative trials the bounds met in practice are longer and skewed upward.
+quadrature. Without repeats V is the usual Fisher information. Looks that repeat networks and images count as so many independent
+ones as have the same spread of a90, and the expected bounds are those that `fit_pod` gives for these where hits and misses are as
+expected: longer than Wald's, which the spread alone would give, and skewed upward.
+Validity: below some 40 informative trials hits and misses may separate, and bounds are longer.
 Source: Liang & Zeger, Biometrika 73 (1986) 13 (the estimating equation); MIL-HDBK-1823A (2009) 4.5.2 (sizes).
 """
 
@@ -18,12 +19,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
+from ..errors import FitError, InputError
+from .hit_miss import fit_pooled, trusted_bound
 from .links import Link, link_from_name
 from .mixed import averaged_eta, averaged_pod
+from .trials import Trials
 
 Array = NDArray[np.float64]
 
+_FINE = 60  # sizes of the pattern that stands for any number of images
+_EXACT = 1e-6  # of the spread of a look at each of these: images without end and no spread of networks
 FEW_TRIALS = 40  # informative ones; below, expect longer intervals than planned
 
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
@@ -71,14 +76,14 @@ class AssumedCurve:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Precision:
-    """What a design may expect: sd of a90 in its unit, one-sided bound over a90, two-sided interval over a90."""
+    """What a design may expect: sd of a90 in its unit, one-sided bound over a90, two-sided interval over a90; None: no such bound."""
 
     networks: int
     images: int
     sd_a90: float
-    bound_over_a90: float
-    low_over_a90: float
-    high_over_a90: float
+    bound_over_a90: float | None
+    low_over_a90: float | None
+    high_over_a90: float | None
 
 
 def expected_precision(curve: AssumedCurve, sizes: ArrayLike, *, networks: int = 1) -> Precision:
@@ -99,29 +104,17 @@ def expected_precision(curve: AssumedCurve, sizes: ArrayLike, *, networks: int =
         raise InputError("sizes", received=f"{size.min():g}", expected="sizes above 0 on log size")
     if networks < 1:
         raise InputError("networks", received=networks, expected="1 or more")
-    x = np.log(size) if curve.log_size else size
-    unit_image, unit_network, information = _pieces(curve, x)
-    bread = np.linalg.inv(networks * information)
-    # looks at one image covary through it, looks by one network at all images through that network
-    meat = networks * information + networks * (networks - 1) * unit_image + networks * unit_network
-    covariance = bread @ meat @ bread
-    c0, c1 = curve.coefficients()
-    total = math.hypot(curve.sd_network, curve.sd_image)
-    x90 = (averaged_eta(0.9, total, link=link_from_name(curve.link)) - c0) / c1
-    toward = np.array([1.0, x90])
-    error = math.sqrt(float(toward @ covariance @ toward)) / c1
-    a90 = math.exp(x90) if curve.log_size else x90
-
-    def over(z: float) -> float:
-        return math.exp(z * error) if curve.log_size else 1 + z * error / a90
-
+    pieces = _pieces(curve, np.log(size) if curve.log_size else size)
+    error = _spread_on_scale(curve, pieces, len(size), len(size), networks)
+    alone = _spread_on_scale(curve, pieces, len(size), len(size), 1, independent=True)
+    bound, low, high = _expected_bounds(curve, size, looks=(alone / error) ** 2)
     return Precision(
         networks=networks,
         images=len(size),
-        sd_a90=error * (a90 if curve.log_size else 1.0),
-        bound_over_a90=over(1.6448536269514722),
-        low_over_a90=over(-1.959963984540054),
-        high_over_a90=over(1.959963984540054),
+        sd_a90=error * (curve.a90 if curve.log_size else 1.0),
+        bound_over_a90=bound,
+        low_over_a90=low,
+        high_over_a90=high,
     )
 
 
@@ -180,12 +173,17 @@ def plan_pod(curve: AssumedCurve, *, wanted_over_a90: float, networks: int = 1, 
     pattern = recommended_sizes(curve, 40, networks=networks)
     low, high = float(pattern[0]), float(pattern[-1])
 
-    fine = np.asarray(np.geomspace(low, high, 200) if curve.log_size else np.linspace(low, high, 200))
+    fine = np.asarray(np.geomspace(low, high, _FINE) if curve.log_size else np.linspace(low, high, _FINE))
     pieces = _pieces(curve, np.log(fine) if curve.log_size else fine)
+    alone = _spread_on_scale(curve, pieces, _FINE, _FINE, 1, independent=True)
 
     def bound(images: float, looks: int) -> float:
         # what an image tells does not depend on their number, so one fine pattern serves every number
-        return _scaled(curve, pieces, len(fine), images, looks)
+        error = _spread_on_scale(curve, pieces, _FINE, images, looks)
+        if error < _EXACT * alone:
+            return 1.0
+        found = _expected_bounds(curve, fine, looks=(alone / error) ** 2)[0]
+        return math.inf if found is None else found
 
     limit = bound(math.inf, networks)
     fewest = _smallest(lambda n: bound(math.inf, n) <= wanted_over_a90, 1_000_000) or 1_000_000
@@ -216,23 +214,51 @@ def _smallest(reached: Callable[[int], bool], most: int) -> int | None:
     return high
 
 
-def _scaled(
-    curve: AssumedCurve, pieces: tuple[Array, Array, Array], pattern: int, images: float, networks: int
+def _spread_on_scale(
+    curve: AssumedCurve,
+    pieces: tuple[Array, Array, Array],
+    pattern: int,
+    images: float,
+    networks: int,
+    *,
+    independent: bool = False,
 ) -> float:
-    """Expected bound over a90 for `images` images spread like the pattern of sizes that the pieces are of."""
+    """Standard deviation of a90 on the fit's scale for `images` images spread like the pattern of sizes that the pieces are of.
+
+    independent: of so many looks that share neither network nor image.
+    """
     unit_image, unit_network, information = (piece / pattern for piece in pieces)
     # the network's piece sums over pairs of images: it grows with their square
     unit_network = unit_network / pattern
     bread = np.linalg.inv(information)
     per_image = bread @ (information / networks + (networks - 1) / networks * unit_image) @ bread
-    per_network = bread @ unit_network @ bread / networks
-    covariance = per_network + (per_image / images if math.isfinite(images) else 0.0)
+    covariance = per_image / images if math.isfinite(images) else np.zeros((2, 2))
+    if not independent:
+        covariance = covariance + bread @ unit_network @ bread / networks
+    c1 = curve.coefficients()[1]
+    toward = np.array([1.0, math.log(curve.a90) if curve.log_size else curve.a90])
+    return math.sqrt(max(float(toward @ covariance @ toward), 0.0)) / c1
+
+
+def _expected_bounds(
+    curve: AssumedCurve, size: Array, *, looks: float
+) -> tuple[float | None, float | None, float | None]:
+    """One-sided bound and two-sided interval over a90 where so many independent looks at each size go as expected; None: none."""
+    link = link_from_name(curve.link)
     c0, c1 = curve.coefficients()
-    total = math.hypot(curve.sd_network, curve.sd_image)
-    x90 = (averaged_eta(0.9, total, link=link_from_name(curve.link)) - c0) / c1
-    toward = np.array([1.0, x90])
-    error = math.sqrt(max(float(toward @ covariance @ toward), 0.0)) / c1
-    return math.exp(1.6448536269514722 * error) if curve.log_size else 1 + 1.6448536269514722 * error / x90
+    eta = c0 + c1 * (np.log(size) if curve.log_size else size)
+    pod = averaged_pod(eta, math.hypot(curve.sd_network, curve.sd_image), link=link)
+    expected = Trials(size=size, hits=looks * pod, misses=looks * (1.0 - pod))
+    try:
+        fit = fit_pooled(expected, link=link, log_size=curve.log_size, method="ml")
+    except FitError:
+        return None, None, None
+    bounds = (fit.a90_95, fit.a90_low_two_sided, fit.a90_95_two_sided)
+    ends = [trusted_bound(one, separated=False) for one in bounds]
+    if fit.a90 is None:
+        return None, None, None
+    bound, low, high = (None if end is None else end / fit.a90 for end in ends)
+    return bound, low, high
 
 
 def _pieces(curve: AssumedCurve, x: Array) -> tuple[Array, Array, Array]:

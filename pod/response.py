@@ -5,7 +5,9 @@ T(response) = b0 + b1 x + tau Z,  POD(a) = Phi((b0 + b1 x - T(decision)) / tau)
 x is the size or its logarithm, T the identity, the logarithm or Box and Cox's (r^lambda - 1) / lambda. Responses at or
 below the left limit (noise) and at or above the right limit (saturation) are censored: they say only that much. The
 POD curve is a probit one with c0 = (b0 - T(decision)) / tau and c1 = b1 / tau; mu = -c0 / c1 and sigma = 1 / c1 are
-the handbook's. Validity: a straight line and normal scatter of one width on the chosen scales (look at the residuals).
+the handbook's. Of n rows the likelihood ratio's bounds take n ln(1 + t^2 / (n - 2)) for chi-square, t Student's quantile, which is
+exact for the line itself; Wald's are the handbook's, and given from 40 rows on.
+Validity: a straight line and normal scatter of one width on the chosen scales (look at the residuals).
 Source: MIL-HDBK-1823A (2009) G.3 and example 1; Olsen, Econometrica 46 (1978) 1211 (the concave form); Box & Cox
 (1964).
 """
@@ -31,6 +33,7 @@ _PROBIT = LINKS["probit"]
 # p-values: a warning for one straight line in a hundred, no bounds for one in a thousand, as readings of a tube are left out
 _DOUBTED = 0.01
 _REJECTED = 0.001
+_FEWEST_FOR_WALD = 40  # rows that the handbook asks for (4.5.2); of five its bound covers six times of ten
 _FEWEST_TO_TEST = 12  # rows: with fewer, p-values that hold for large samples say little
 
 
@@ -110,6 +113,13 @@ def fit_response_pod(
             raise InputError(name, received=repr(limit), expected="a finite response")
     if left is not None and right is not None and not left < right:
         raise InputError("left and right", received=f"{left:g} and {right:g}", expected="a left limit below the right")
+    if (left is not None and decision < left) or (right is not None and decision > right):
+        raise InputError(
+            "decision",
+            received=f"{decision:g}",
+            expected=f"a response between the limits, {-math.inf if left is None else left:g} to"
+            f" {math.inf if right is None else right:g}: beyond them nothing was seen",
+        )
     if box_cox is None:
         from scipy.optimize import minimize_scalar
 
@@ -178,12 +188,20 @@ def fit_response_pod(
         if clustered is not None:
             spread, freedom_at = clustered.variance(toward @ matrix)
             variance, freedom = float(spread), float(freedom_at)
+        # of few rows the scatter is known as well as so many rows less the line's two coefficients tell it
+        rows, left_over = float(line.exact.sum()), float(line.exact.sum()) - 2.0
+        if clustered is None:
+            freedom = left_over
         error = math.sqrt(variance) / c1
         divisor = variance / float(toward @ matrix @ parameter_covariance @ matrix.T @ toward)
 
         def wald(below: float, z: float, side: float) -> float | None:
             if clustered is None:
-                return x90 + side * z * error
+                return (
+                    x90 + side * float(student_quantile(below, math.inf)) * error
+                    if len(x) >= _FEWEST_FOR_WALD
+                    else None
+                )
             variances = clustered.variance
 
             def excess(at: float) -> tuple[float, float, float]:
@@ -195,7 +213,14 @@ def fit_response_pod(
         bounds = [
             Bounds(
                 likelihood_ratio=size_from_x(
-                    _bound(line, threshold, x90, side * z * error, z * z * divisor), log_size=log_size
+                    _bound(
+                        line,
+                        threshold,
+                        x90,
+                        side * z * error,
+                        rows * math.log1p(z * z / left_over) if clustered is None else z * z * divisor,
+                    ),
+                    log_size=log_size,
                 ),
                 wald=size_from_x(wald(below, z, side), log_size=log_size),
             )

@@ -250,7 +250,7 @@ def test_a_small_plan_says_that_it_is_for_large_samples(capsys):
     words = ["plan", "--a50", "1", "--a90", "2", "--images"]
     assert main([*words, "20"]) == 0
     captured = capsys.readouterr()
-    assert "with 20 images, fewer than some 40, expect a longer interval" in captured.err
+    assert "with 20 images, fewer than some 40, hits and misses may separate" in captured.err
     assert "1 network, 20 images" in captured.out
     assert main([*words, "60"]) == 0
     assert capsys.readouterr().err == ""

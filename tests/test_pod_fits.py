@@ -12,7 +12,7 @@ from raytwin.errors import FitError, InputError
 from raytwin.pod import LINKS, check_trials, compare_models, curve_with_band, fit_batch, fit_many, fit_pod, joint_region
 from raytwin.pod.hit_miss import Z_ONE_SIDED, Z_TWO_SIDED, trusted_bound
 from raytwin.pod.likelihood import profile, size_bound
-from raytwin.pod.models import better_curve, over_links, widened
+from raytwin.pod.models import better_curve, over_links, with_links_open
 from raytwin.pod.separation import check_separation
 
 
@@ -253,8 +253,7 @@ def test_bounds_of_a_curve_that_fits_worse_reach_as_far_as_those_of_curves_that_
     fit = fit_pod(size, hit, link="cloglog")
     assert better_curve(found, fit) is found[0]
     assert better_curve(found, fit_pod(size, hit, link="logit", log_size=True)) is None
-    joined = over_links(found, link="cloglog", log_size=False)
-    wide = widened(fit, joined, found[0])
+    wide, joined, _ = with_links_open(fit, found, named=False)
     true = 2.0 * 9.0**0.2
     assert not fit.a90_low_two_sided.modified <= true <= fit.a90_95_two_sided.modified
     assert wide.a90_low_two_sided.modified <= true <= wide.a90_95_two_sided.modified
@@ -265,6 +264,49 @@ def test_bounds_of_a_curve_that_fits_worse_reach_as_far_as_those_of_curves_that_
     named = rt.fit_pod({"size": size, "hit": hit}, size="size", hit="hit", link="cloglog")
     assert named.fit == fit
     assert any("another curve fits better" in text for text in named.warnings)
+
+
+@pytest.mark.parametrize("log_size", [True, False])
+def test_a_sharp_step_has_the_curve_of_jeffreys_prior(log_size):
+    """Heinze and Schemper, Stat. Med. 21 (2002) 2409: the logit's bias-reduced fit maximises l + ln |I| / 2, which is finite."""
+    from scipy.optimize import minimize
+
+    size = np.linspace(0.5, 3.0, 90)
+    hit = (size > 1.51).astype(float)
+    fit = fit_pod(size, hit, link="logit", log_size=log_size)
+    x = np.log(size) if log_size else size
+
+    def cost(c):
+        eta = c[0] + c[1] * x
+        share = 1.0 / (1.0 + np.exp(-eta))
+        information = np.array([[np.sum(share * (1 - share) * x**k) for k in (i, i + 1)] for i in (0, 1)])
+        return -np.sum(hit * eta - np.logaddexp(0.0, eta)) - 0.5 * np.linalg.slogdet(information)[1]
+
+    best = minimize(
+        cost, (-10.0 * x[36], 10.0), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12, "maxiter": 4000}
+    )
+    assert fit.separated
+    assert (fit.c0, fit.c1) == pytest.approx(tuple(best.x), rel=1e-4)
+    assert 1.51 < fit.a90 < fit.a90_95.wald < 1.9
+
+
+def test_curves_of_one_a90_and_two_slopes_do_not_differ_because_the_default_link_is_another():
+    """Logit on ln size: nine times of ten the default's own bounds would call these two different."""
+    size = np.exp(np.linspace(np.log(0.3), np.log(6.0), 200))
+    rng = np.random.default_rng(9)
+    tables = []
+    for scale in (0.25, 0.4345):
+        middle = np.log(2.598) - np.log(9.0) * scale
+        hit = rng.random(200) < 1.0 / (1.0 + np.exp(-(np.log(size) - middle) / scale))
+        tables.append({"size": size, "hit": hit})
+    found = rt.compare(*tables)
+    assert found.comparison.ratio_a90.low < 1.0 < found.comparison.ratio_a90.high
+    assert found.verdict == "inconclusive"
+    assert any(text.startswith("second: another curve fits better") for text in found.warnings)
+    # a link that was asked for is taken at its word, in curves too
+    named = rt.compare(*tables, link="cloglog")
+    assert named.comparison.ratio_a90.low > 1.0
+    assert rt.compare(*(rt.fit_pod(table, link="cloglog") for table in tables)).comparison == named.comparison
 
 
 @pytest.mark.parametrize(("top", "reaches"), [(0.97, True), (0.82, False)])

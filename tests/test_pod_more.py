@@ -118,6 +118,25 @@ def test_response_bounds_cover_as_stated():
     assert covered > 0.95 * 150 - 4 * 2.7
 
 
+def test_bounds_of_few_responses_are_those_of_students_t_and_walds_are_not_given():
+    """Chi-square's quantile would cover 75 % with five rows; 95 % of 120 within three standard errors, 2.4 each."""
+    covered, size = 0, np.linspace(1.0, 3.0, 5)
+    for seed in range(120):
+        response = size + np.random.default_rng(seed).normal(0.0, 0.2, 5)
+        fit = fit_response_pod(size, response, decision=1.7)
+        low, high = fit.a90_low_two_sided.likelihood_ratio, fit.a90_95_two_sided.likelihood_ratio
+        covered += (low is None or low <= 1.9563) and (high is None or high >= 1.9563)
+        assert fit.a90_95.wald is None
+    assert covered > 0.95 * 120 - 3 * 2.4
+
+
+@pytest.mark.parametrize("limits", [{"left": 3.0}, {"right": 1.0}])
+def test_a_decision_beyond_what_was_seen_is_refused(limits):
+    size = np.linspace(0.0, 5.0, 30)
+    with pytest.raises(InputError, match="decision: got 2; expected a response between the limits"):
+        fit_response_pod(size, size + np.random.default_rng(1).normal(0.0, 0.3, 30), decision=2, **limits)
+
+
 def test_box_cox_finds_the_scale_that_made_the_data():
     random = np.random.default_rng(5)
     size = random.uniform(1, 10, 400)

@@ -395,6 +395,24 @@ def test_false_alarms_that_come_by_image_count_less():
         false_alarm_rate([0, 2])
 
 
+def test_few_false_alarms_are_those_of_as_many_looks_whoever_looked():
+    """A second network that alarms as seldom tells more, not less; and none in 400 looks is no wider than one look an image."""
+    network, image = np.repeat(np.arange(2), 200), np.tile(np.arange(200), 2)
+    highs = []
+    for alarms in (0, 1, 3):
+        alarm = np.zeros(400)
+        alarm[np.arange(alarms) * 101] = 1.0
+        found = false_alarm_rate(alarm, network=network, image=image)
+        assert not found.networks_differ
+        highs.append(found.high)
+    assert highs[0] == pytest.approx(1 - 0.025 ** (1 / 200))
+    assert highs[1] == pytest.approx(false_alarm_rate(np.eye(1, 400)[0]).high, rel=0.02)
+    assert highs[2] < 0.025
+    # one network alone alarms: that of another may be anything
+    alone = false_alarm_rate(np.where(network == 0, image % 10 == 0, 0), network=network, image=image)
+    assert alone.networks_differ and alone.high > 0.5
+
+
 @lru_cache(maxsize=1)
 def fit_of_identical_networks() -> tuple[PodFit, PodFit]:
     """A crossed fit of three networks with the same hits, and the fit of one of them alone."""

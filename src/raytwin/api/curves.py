@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import pandas
     from typing_extensions import TypeIs
 
-    from ..pod import Alternative, Comparison, Plan, PodFit, Precision, ResponseFit, Roc, Trials
+    from ..pod import Comparison, Plan, PodFit, Precision, ResponseFit, Roc, Trials
     from ..pod.planning import AssumedCurve
 
     TableLike: TypeAlias = (
@@ -42,7 +42,7 @@ class PodCurve(Result):
 
     Fields: fit; table (what was read); more (beyond the curve, by name: `alternatives`, `over_links`, `false_alarms`,
     `lapse`, `bootstrap`, `covariates`, `explanation`, `as_published`, `roc`); warnings; response_label (the response's
-    column, None for hits) with its censoring limits.
+    column, None for hits) with its censoring limits; link_named: whether the link was asked for, and not the default one.
     """
 
     fit: "PodFit | ResponseFit"
@@ -52,6 +52,7 @@ class PodCurve(Result):
     response_label: str | None = None
     left_censored: float | None = None
     right_censored: float | None = None
+    link_named: bool = False
 
     @property
     def a50(self) -> float | None:
@@ -306,9 +307,10 @@ class PodPlan(Result):
             ("images", "no number is enough" if self.images is None else f"{self.images}"),
         ]
         if self.expected is not None:
-            rows.append(("expected a90/95", number_text(self.assumed.a90 * self.expected.bound_over_a90)))
-            ends = (self.assumed.a90 * end for end in (self.expected.low_over_a90, self.expected.high_over_a90))
-            rows.append(("two-sided 95 %", " to ".join(number_text(end) for end in ends)))
+            shares = (self.expected.bound_over_a90, self.expected.low_over_a90, self.expected.high_over_a90)
+            bound, *ends = (number_text(None if share is None else self.assumed.a90 * share) for share in shares)
+            rows.append(("expected a90/95", bound))
+            rows.append(("two-sided 95 %", " to ".join(ends)))
         if len(self.sizes):
             rows.append(("sizes", f"{self.sizes.min():.4g} to {self.sizes.max():.4g}"))
         title = f"POD study: assumed a50 {self.assumed.a50:.4g}, a90 {self.assumed.a90:.4g}, {self.assumed.link}"
@@ -496,7 +498,7 @@ def _hit_curve(
 ) -> PodCurve:
     from ..pod import compare_models, fit_as_published
     from ..pod import fit_pod as fit_columns
-    from ..pod.models import better_curve, over_links, widened
+    from ..pod.models import with_links_open
 
     chosen = link or "cloglog"
     with _naming_far_sizes(table=table):
@@ -518,14 +520,10 @@ def _hit_curve(
     trials = trials_from_table(table, log_size=log_size)
     alternatives = compare_models(trials)
     more: dict[str, Any] = {"alternatives": [asdict(one) for one in alternatives]}
-    if fit.repeats == "pooled" and not fit.separated:
-        joined = over_links(alternatives, link=chosen, log_size=log_size)
-        more["over_links"] = None if joined is None else asdict(joined)
-        best = better_curve(alternatives, fit)
-        if best is not None and joined is not None:
-            warnings.append(_better_told(fit, best, widened=link is None))
-            if link is None:
-                fit = widened(fit, joined, best)
+    fit, joined, better = with_links_open(fit, alternatives, named=link is not None)
+    if joined is not None:
+        more["over_links"] = asdict(joined)
+    warnings += [] if better is None else [better]
     asked: dict[str, Callable[[], Any]] = {}
     if ceiling or floor:
         asked["lapse"] = lambda: _lapse(trials, fit, ceiling=ceiling, floor=floor, warnings=warnings)
@@ -543,21 +541,7 @@ def _hit_curve(
             warnings.append(f"no {name}: {error}")
     if as_published:
         more["as_published"] = asdict(fit_as_published(trials))
-    return PodCurve(fit=fit, table=table, more=plain(more), warnings=tuple(warnings))
-
-
-def _better_told(fit: "PodFit", best: "Alternative", *, widened: bool) -> str:
-    """A warning that another curve fits far better; widened: bounds are those of all that fit."""
-    from ..pod.models import ends_below_90
-
-    better = f"another curve fits better: {best.name} (AIC lower by {(fit.aic or 0.0) - (best.aic or 0.0):.3g}"
-    if widened and ends_below_90(best):
-        return f"{better}); it ends below 90 %, so there is no a90"
-    told = "none" if best.a90 is None else f"{best.a90:.4g}"
-    bounds = (
-        "bounds are those of all curves that fit" if widened else "bounds of all curves that fit stand in over_links"
-    )
-    return f"{better}, a90 {told}); {bounds}"
+    return PodCurve(fit=fit, table=table, more=plain(more), warnings=tuple(warnings), link_named=link is not None)
 
 
 @contextmanager
@@ -795,7 +779,8 @@ def compare(
         margin: on a90, as a share of it.
         size_margin: also on the difference of the two a90, in the tables' unit.
         size, hit, trials, site, where: columns of both tables, as for `fit_pod`.
-        link, log_size, method, repeats: as for `fit_pod`; None: as the curves were fitted, else the defaults.
+        link, log_size, method, repeats: as for `fit_pod`; None: as the curves were fitted, else the defaults. Where no link was
+            asked for and another curve fits one table better, a90's bounds there are those of all curves that fit, as of `fit_pod`.
         unpaired: images and networks of the same name are not the same ones.
 
     Returns:
@@ -822,7 +807,9 @@ def compare(
             expected="the same size column in both tables",
             remedy="name it with size",
         )
-    fits = [table.fit for table in (first, second) if isinstance(table, PodCurve)]
+    curves = [table for table in (first, second) if isinstance(table, PodCurve)]
+    fits = [curve.fit for curve in curves]
+    named = link is not None or any(curve.link_named for curve in curves)
     link = _agreed("link", link, [fit.link for fit in fits if not is_response(fit)], "cloglog")
     on_log_size = _agreed("log_size", log_size, [fit.log_size for fit in fits], False)
     if repeats is None:
@@ -842,6 +829,7 @@ def compare(
             size_margin=size_margin,
             shared_images=shared["image"] and not unpaired,
             shared_networks=shared["network"] and not unpaired,
+            link_named=named,
         )
     return PodComparison(
         comparison=found,
@@ -919,7 +907,7 @@ def plan(
     """
     from ..pod.planning import expected_precision, plan_pod, recommended_sizes
 
-    assumed = _assumed(
+    assumed, told = _assumed(
         a50=a50,
         a90=a90,
         pilot=pilot,
@@ -939,7 +927,7 @@ def plan(
             images=images,
             expected=expected,
             sizes=sizes,
-            warnings=_warnings_of_few(images),
+            warnings=(*told, *_warnings_of_few(images)),
         )
     found: Plan = plan_pod(assumed, wanted_over_a90=wanted, networks=networks)
     warnings = _warnings_of_few(found.images)
@@ -957,7 +945,7 @@ def plan(
         wanted_over_a90=found.wanted_over_a90,
         limit_over_a90=found.limit_over_a90,
         fewest_networks=found.fewest_networks,
-        warnings=warnings,
+        warnings=(*told, *warnings),
     )
 
 
@@ -967,7 +955,7 @@ def _warnings_of_few(images: int | None) -> tuple[str, ...]:
     if images is None or images >= FEW_TRIALS:
         return ()
     return (
-        f"the plan is for large samples: with {images} images, fewer than some {FEW_TRIALS}, expect a longer interval",
+        f"with {images} images, fewer than some {FEW_TRIALS}, hits and misses may separate, and bounds are longer then",
     )
 
 
@@ -982,13 +970,15 @@ def _assumed(
     sd_network: float,
     sd_image: float,
     networks: int,
-) -> "AssumedCurve":
+) -> "tuple[AssumedCurve, tuple[str, ...]]":
+    """What is assumed, and what was said of the pilot's curve."""
     from ..pod.planning import AssumedCurve
 
     if pilot is None:
         if a50 is None or a90 is None:
             raise InputError("a50 and a90", received="not both", expected="both sizes", remedy="or a pilot's table")
-        return AssumedCurve(a50=a50, a90=a90, link=link, log_size=log_size, sd_network=sd_network, sd_image=sd_image)
+        given = AssumedCurve(a50=a50, a90=a90, link=link, log_size=log_size, sd_network=sd_network, sd_image=sd_image)
+        return given, ()
     curve = pilot if isinstance(pilot, PodCurve) else fit_pod(pilot, size=size, link=link, log_size=log_size)
     fit = curve._of_hits()
     if fit.a50 is None or fit.a90 is None:
@@ -1006,7 +996,7 @@ def _assumed(
             remedy="plan with one network: such networks add nothing to each other",
         )
     crossed = fit.crossed
-    return AssumedCurve(
+    assumed = AssumedCurve(
         a50=fit.a50,
         a90=fit.a90,
         link=fit.link,
@@ -1014,3 +1004,4 @@ def _assumed(
         sd_network=(crossed.sd_network or 0.0) if crossed else 0.0,
         sd_image=(crossed.sd_image or 0.0) if crossed else 0.0,
     )
+    return assumed, tuple(f"pilot: {text}" for text in curve.warnings)

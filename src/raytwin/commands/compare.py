@@ -33,7 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", metavar="COLUMN", help="default: contrast, size, size_mm, ... the first there")
     parser.add_argument("--hit", metavar="COLUMN", help="0 or 1; default: hit")
     parser.add_argument("--trials", metavar="COLUMN", help="number of trials of each row (grouped data)")
-    parser.add_argument("--link", default="cloglog", choices=("cloglog", "loglog", "logit", "probit"))
+    parser.add_argument(
+        "--link",
+        choices=("cloglog", "loglog", "logit", "probit"),
+        help="default: cloglog, with the bounds of all links that fit where another fits better",
+    )
     parser.add_argument("--log-size", action="store_true", help="curves on the logarithm of the size")
     parser.add_argument("--method", choices=("ml", "firth"))
     parser.add_argument("--repeats", choices=("crossed", "scaled", "cluster", "pooled"))
@@ -56,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
         site=arguments.site,
         where=where_from_options(arguments.where),
         link=arguments.link,
-        log_size=arguments.log_size,
+        log_size=arguments.log_size or None,
         method=arguments.method,
         repeats=arguments.repeats,
         unpaired=arguments.unpaired,

@@ -69,10 +69,12 @@ def _text(result: dict[str, Any]) -> str:
     expected = result["expected"]
     if expected is not None:
         a90 = curve["a90"]
-        lines.append(
-            f"expected a90/95 {shown(a90 * expected['bound_over_a90'])} ({expected['bound_over_a90']:.3f} a90);"
-            f" two-sided 95 % {shown(a90 * expected['low_over_a90'])} to {shown(a90 * expected['high_over_a90'])}"
+        bound, low, high = (
+            None if expected[f"{name}_over_a90"] is None else a90 * expected[f"{name}_over_a90"]
+            for name in ("bound", "low", "high")
         )
+        ratio = "" if bound is None else f" ({bound / a90:.3f} a90)"
+        lines.append(f"expected a90/95 {shown(bound)}{ratio}; two-sided 95 % {shown(low)} to {shown(high)}")
     sizes = result["sizes"]
     if sizes:
         how = "evenly on ln size" if curve["log_size"] else "evenly"

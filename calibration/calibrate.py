@@ -10,7 +10,7 @@ import numpy as np
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.cut_off import without_cut_off_darks
 from ..acquisition.setting import Filter
-from ..errors import FitError
+from ..errors import FitError, InputError
 from ..generator.line.spectral_signal import KV_STEP, OTHER_TABLES, OpenBeam
 from ..generator.line.twin import BAD_PIXEL_CODES, BAD_PIXEL_MAP, Twin
 from ..generator.twins.twin_answer import calibration_answer
@@ -167,6 +167,14 @@ def _prepare_spectra(acquisition: AcquisitionFile, *, tell: Callable[[str], None
     flats = [item for item in acquisition.of_kind("flat") if item.kV is not None and item.role != "evaluation"]
     anode = acquisition.instrument.anode or "W"
     measured = sorted({float(item.kV or 0.0) for item in flats})
+    for item in flats:
+        if anode in MAXIMUM_KV_OF_ANODE and not MINIMUM_KV <= float(item.kV or 0.0) <= MAXIMUM_KV_OF_ANODE[anode]:
+            raise InputError(
+                f"series {item.name}: kV",
+                received=f"{item.kV:g} kV",
+                expected=f"{MINIMUM_KV:g} to {MAXIMUM_KV_OF_ANODE[anode]:g} kV, as far as spectra of {anode} go",
+                remedy="correct the label, or declare the series' role as `evaluation`",
+            )
     if not measured or not (measured[0] >= MINIMUM_KV and measured[-1] <= MAXIMUM_KV_OF_ANODE.get(anode, 0.0)):
         return  # whatever is wrong is said where it belongs
     tell("spectra")

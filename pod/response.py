@@ -365,7 +365,9 @@ def _fit(x: Array, response: Array, box_cox: float, left: float | None, right: f
     is_right = np.zeros(len(x), bool) if right is None else response >= right
     exact = ~(is_left | is_right)
     if exact.sum() < 3 or np.ptp(x[exact]) == 0:
-        raise FitError("a response curve needs at least three responses between the limits, at two sizes or more")
+        raise FitError(
+            "a response curve needs at least three responses between the limits, at two sizes: give more rows or wider limits"
+        )
     clipped = np.clip(response, left, right) if left is not None or right is not None else response
     if box_cox != 1 and not np.all(clipped > 0):
         raise InputError(
@@ -381,7 +383,9 @@ def _fit(x: Array, response: Array, box_cox: float, left: float | None, right: f
     beta, *_ = np.linalg.lstsq(design, y[exact], rcond=None)
     scatter = float(np.std(y[exact] - design @ beta))
     if not scatter > 1e-12 * max(1.0, float(np.abs(y).max())):
-        raise FitError("the responses lie on a line without any scatter: there is nothing to infer POD from")
+        raise FitError(
+            "the responses lie on a line without any scatter: there is nothing to infer POD from; give measured responses"
+        )
     line = _Line(
         rows=rows,
         exact=exact,

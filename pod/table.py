@@ -81,7 +81,7 @@ class PodTable(ByValue):
         """
         if name == self.size_name:
             return self.size
-        column = _chosen(name, list(self.other), "column")
+        column = _chosen(name, list(self.other), "covariate or explaining column")
         values = np.empty(len(self.size))
         for row, text in enumerate(self.other[column]):
             values[row] = _number(text, column, f"row {row + 1}")
@@ -331,7 +331,9 @@ def _chosen(name: str, header: list[str], option: str) -> str:
     raise InputError(
         option,
         received=repr(name),
-        expected="a column of the table: " + ", ".join(header),
+        expected="a column of the table: " + ", ".join(header)
+        if header
+        else "a column of the table, which has no further ones",
         remedy=f"did you mean {hint}?" if hint else "",
     )
 

@@ -107,7 +107,8 @@ class UncalibratedLine:
 class ContrastChannel:
     """One tube voltage of the pair.
 
-    Fields: open_signal_DN (one frame); M_product, M_object (with the object), sd_M_product, sd_M_object (one pixel of
+    Fields: open_signal_DN (one frame; in open_signal_unit, which is keV absorbed or counts for a line that was described, since
+    that has no gain); M_product, M_object (with the object), sd_M_product, sd_M_object (one pixel of
     the averaged frame); mu_eff_product_per_mm, mu_eff_object_per_mm (each alone, at its thickness).
     """
 
@@ -119,6 +120,7 @@ class ContrastChannel:
     sd_M_object: float
     mu_eff_product_per_mm: float
     mu_eff_object_per_mm: float
+    open_signal_unit: str = "DN"
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers by the fields' names."""
@@ -194,6 +196,7 @@ class _Beam:
     secondary_DN: float
     saturated: bool
     warnings: tuple[str, ...]
+    unit: str = "DN"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -304,6 +307,7 @@ def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | N
         secondary_DN=0.0,
         saturated=False,
         warnings=warnings,
+        unit="counts" if line.counting else "keV",
     )
 
 
@@ -428,6 +432,16 @@ def _crossed(
     )
 
 
+def check_pair(low: Setting, high: Setting) -> None:
+    """Raise `InputError` where a pair of settings has one spectrum, or the higher kV first."""
+    if low.kV > high.kV or (low.kV == high.kV and low.filters == high.filters):
+        raise InputError(
+            "low and high setting",
+            received=f"{low} and {high}",
+            expected="two different spectra, the lower kV first",
+        )
+
+
 def _slabs(
     beam: _Beam, crossed: _Crossed, setting: Setting, detector: _Detector, *, product: Filter, foreign_object: Filter
 ) -> _Slabs:
@@ -437,7 +451,7 @@ def _slabs(
         if not 1e-30 < signal < 1e30:
             raise InputError(
                 "setting",
-                received=f"{signal:.3g} DN behind product and object at {setting.kV:g} kV",
+                received=f"{signal:.3g} {beam.unit} behind product and object at {setting.kV:g} kV",
                 expected="a signal that a detector could hold",
                 remedy="check tube load, distance, pixel pitch and output",
             )
@@ -457,6 +471,7 @@ def _slabs(
             sd_M_object=math.sqrt(spreads[1]),
             mu_eff_product_per_mm=float(crossed.M_product[0]) / product.thickness_mm,
             mu_eff_object_per_mm=crossed.M_object_alone / foreign_object.thickness_mm,
+            open_signal_unit=beam.unit,
         ),
         M_product=crossed.M_product,
         M_object=crossed.M_object,
@@ -652,12 +667,7 @@ class SlabContrasts:
         Raises:
             InputError: as there.
         """
-        if low.kV > high.kV or (low.kV == high.kV and low.filters == high.filters):
-            raise InputError(
-                "low and high setting",
-                received=f"{low} and {high}",
-                expected="two different spectra, the lower kV first",
-            )
+        check_pair(low, high)
         by_table = {}
         for table in TABLES if intervals else ("xraylib",):
             q_product, q_object = _quotients(self._behind(low, intervals, table), self._behind(high, intervals, table))

@@ -41,19 +41,17 @@ def calibration_answer(twin: Twin | TubeTwin) -> dict[str, Any]:
 
     spectral = twin.spectral
     filtration = flux = None
-    warnings = list(twin.warnings)
     if spectral is not None:
         filtration = equivalent_filtration(spectral)
         if any(level.rate_DN_per_mAs for level in twin.levels):
             flux = _output_scale(twin)
-    if twin.noise.spread.gaussian_px is None:
-        warnings.append(
-            "psf_sigma_px is null: most of the light is in the tail of the spread, which no Gaussian width describes; see `spread`"
-        )
-    if filtration is None:
-        warnings.append("inherent_filtration_mm_Al is null: the twin has no spectral part")
-    if flux is None:
-        warnings.append("flux_scale is null: it needs kV and tube load")
+    reasons = {
+        "psf_sigma_px": "most of the light is in the tail of the spread, which no Gaussian width describes; see `spread`",
+        "inherent_filtration_mm_Al": "the twin has no spectral part",
+        "flux_scale": "it needs kV and tube load",
+    }
+    found = {"psf_sigma_px": twin.noise.spread.gaussian_px, "inherent_filtration_mm_Al": filtration, "flux_scale": flux}
+    nulls = [f"{name} is null: {reasons[name]}" for name, value in found.items() if value is None]
     return {
         "psf_sigma_px": plain(twin.noise.spread.gaussian_px),
         "spread": spread_answer(twin.noise.spread),
@@ -85,7 +83,7 @@ def calibration_answer(twin: Twin | TubeTwin) -> dict[str, Any]:
         "undetermined": list(spectral.undetermined) if spectral is not None else [],
         "next_measurement": twin.evidence.get("next_measurement"),
         "evidence": dict(twin.evidence),
-        "warnings": warnings,
+        "warnings": [*twin.warnings, *nulls],
     }
 
 
@@ -118,8 +116,9 @@ def twin_table(twin: Twin) -> Table:
         notes.append("no spectral part: predictions at the measured kV and filters only")
     if twin.effects:
         notes.append("effects: " + ", ".join(item.id for item in twin.effects))
-    if answer["warnings"]:
-        notes.append(f"{len(answer['warnings'])} warnings: see .warnings")
+    notes += answer["warnings"][len(twin.warnings) :]
+    if twin.warnings:
+        notes.append(f"{counted(len(twin.warnings), 'warning')}: see .warnings")
     return Table(title=title, header=("", "value", "95 % interval", "unit"), rows=tuple(rows), notes=tuple(notes))
 
 

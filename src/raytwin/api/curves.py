@@ -410,6 +410,13 @@ def fit_pod(
         image=image,
         where=where,
     )
+    explain = (explain,) if isinstance(explain, str) else explain
+    if covariates is not None and not isinstance(covariates, Mapping):
+        raise InputError(
+            "covariates",
+            received=type(covariates).__name__,
+            expected="a dictionary: column -> value at which the curve is taken, or None for its median",
+        )
     if response is not None or read.response is not None:
         of_hits = {
             "method": method,

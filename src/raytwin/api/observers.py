@@ -190,6 +190,7 @@ def observe(
     """
     import numpy as np
 
+    from ..generator.predictions.contrast import check_pair
     from ..observers import LineImages, Observer, observe_settings, predicted_sizes
 
     pairs = _pairs(settings)
@@ -207,6 +208,9 @@ def observe(
         )
     if changes:
         observer = Observer(**changes)
+    if observer.image in ("residual", "quotient"):
+        for pair in pairs:
+            check_pair(*pair)
     if (references is None) == (product is None and foreign_object is None):
         raise InputError(
             "product and references",

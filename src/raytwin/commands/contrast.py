@@ -140,7 +140,7 @@ def _text(found: Any, result: dict[str, Any]) -> str:
         lines.append(f"{name:<5} {channel.setting}")
         lines.append(
             f"      M {channel.M_product:.4f} around, {channel.M_object:.4f} behind the object"
-            f" (+- {channel.sd_M_object:.4f} a pixel); open {channel.open_signal_DN:.5g} DN"
+            f" (+- {channel.sd_M_object:.4f} a pixel); open {channel.open_signal_DN:.5g} {channel.open_signal_unit}"
         )
         lines.append(
             f"      mu_eff product {channel.mu_eff_product_per_mm:.5g} /mm, object {channel.mu_eff_object_per_mm:.5g} /mm"

@@ -396,7 +396,7 @@ def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
     def columns(beams_differ):
         model = SimpleNamespace(sharp=False, beams_differ=beams_differ, base=None)
         session = SimpleNamespace(model=model, maps=SimpleNamespace(shares={}))
-        return nuisances_of_series(session, probes, signal, Redrawn(thicker={"Al": (thinner, {})}, straight=None))
+        return nuisances_of_series(session, probes, signal, Redrawn(thicker={"Al": (thinner, {})}, covered=None))
 
     usual, wider = columns(1.0), columns(3.0)
     # all exposures 20 us longer or shorter than stated

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter, shift
 
 from raytwin.diagnosis.model.placing import MeasuredScenes, _as_drawn
 from raytwin.diagnosis.probes.registration import local_range
-from raytwin.diagnosis.probes.straight_edge import distance_px, scatter_share, straight_scene
+from raytwin.diagnosis.probes.straight_edge import covered_scene, distance_px, scatter_share
 from raytwin.generator.line.series_request import SeriesRequest
 
 SHAPE = (64, 80)
@@ -45,7 +45,7 @@ def test_a_border_is_found_to_a_twentieth_of_a_pixel(rays, slope, turned, on_the
 @pytest.mark.parametrize("turned", [False, True])
 def test_points_give_the_pixels_that_the_border_covers(slope, turned):
     points, pixels = edge(slope, rays=1), edge(slope, rays=RAYS)
-    found = straight_scene({"Pb": points.T if turned else points})["Pb"]
+    found = covered_scene("edge", {"Pb": points.T if turned else points})["Pb"]
     assert np.abs(points - pixels).max() > 0.9  # of 2 mm
     assert np.abs((found.T if turned else found) - pixels).max() < 0.12
 
@@ -65,7 +65,33 @@ def test_points_give_the_pixels_that_the_border_covers(slope, turned):
 )
 def test_what_is_no_straight_edge_has_none(maps):
     assert distance_px(maps) is None
-    assert straight_scene(maps) is None
+    assert covered_scene("edge", maps) is None
+    assert covered_scene("product", maps) is None
+
+
+@pytest.mark.parametrize("rays", [1, RAYS])
+@pytest.mark.parametrize(("middle", "radius"), [((31.2, 40.7), 21.7), ((33.0, 39.5), 8.4)])
+def test_the_middles_of_pixels_give_those_that_a_disc_covers(rays, middle, radius):
+    fine = np.stack(np.meshgrid(*((np.arange(side * RAYS) + 0.5) / RAYS - 0.5 for side in SHAPE), indexing="ij"))
+    inside = np.hypot(fine[0] - middle[0], fine[1] - middle[1]) < radius
+    pixels = 2.0 * inside.reshape(SHAPE[0], RAYS, SHAPE[1], RAYS).mean(axis=(1, 3))
+    points = 2.0 * (np.hypot(*(np.indices(SHAPE) - np.reshape(middle, (2, 1, 1)))) < radius)
+    found = covered_scene("disc", {"W": pixels if rays > 1 else points})["W"]
+    assert np.abs(points - pixels).max() > 0.8  # of 2 mm
+    assert np.abs(found - pixels).max() < 0.25
+    assert np.sqrt(np.mean((found - pixels)[(pixels > 0) & (pixels < 2)] ** 2)) < 0.1
+
+
+def test_what_is_no_disc_is_not_drawn_as_one():
+    rows, columns = np.indices(SHAPE) - 32.0
+    for inside in (
+        np.hypot(rows, 0.8 * columns) < 20.0,
+        np.maximum(abs(rows), abs(columns)) < 15.0,
+        np.hypot(rows, columns) < 3.0,
+    ):
+        assert covered_scene("disc", {"W": 2.0 * inside}) is None
+    beyond_the_border = np.hypot(rows, columns - 45.0) < 20.0
+    assert covered_scene("disc", {"W": 2.0 * beyond_the_border}) is None
 
 
 def share_of(picture, model, slope):

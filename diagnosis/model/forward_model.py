@@ -42,8 +42,9 @@ class ForwardModel:
 
     @property
     def sharp(self) -> bool:
-        """Whether pixels see no farther than themselves."""
-        return self.base.noise.spread.value.sigma_px < SHARP_PX
+        """Whether pixels see no farther than themselves, along one axis at least."""
+        spread = self.base.noise.spread.value
+        return spread.sigma_px < SHARP_PX or spread.axes != "both"
 
     @property
     def beams_differ(self) -> float:

@@ -20,7 +20,7 @@ from ..probes.registration import (
     register_drawn,
     without_border,
 )
-from ..probes.straight_edge import straight_scene
+from ..probes.straight_edge import covered_scene
 from ..session.even_maps import full_size, signal_map
 from ..session.session import SessionSeries
 from . import changes as scales
@@ -128,16 +128,16 @@ def _as_drawn(
 ) -> tuple[Sequence[SessionSeries], Placement | None]:
     """Series of one place with the maps that show their scene more truly, and where it lies.
 
-    A straight border that jumps from pixel to pixel in its map, as rays to the middle of each have it, is drawn so or as it runs:
-    real pixels see their whole square, most simulations the middle of it.
+    A straight or round border that jumps from pixel to pixel in its map, as rays to the middle of each have it, is drawn so or as it
+    runs: real pixels see their whole square, most simulations the middle of it.
     """
     placement = _placement(members, expected, measured)
     asked = members[0].request
     maps = asked.thickness_mm or {}
-    straight = straight_scene(maps) if asked.scene_kind == "edge" and sampled_at_points(maps) else None
-    if placement is None or straight is None:
+    covered = covered_scene(asked.scene_kind, maps) if sampled_at_points(maps) else None
+    if placement is None or covered is None:
         return members, placement
-    others = [replace(item, request=replace(item.request, thickness_mm=straight)) for item in members]
+    others = [replace(item, request=replace(item.request, thickness_mm=covered)) for item in members]
 
     def left(drawn: Sequence[SessionSeries]) -> float:
         at = (placement.row_px, placement.column_px)

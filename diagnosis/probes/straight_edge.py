@@ -1,8 +1,9 @@
-"""How truly a straight edge is drawn, by its oversampled profile.
+"""Borders of edges and discs as they run between the points of a map, and how truly a straight one is drawn.
 
 The border of a straight edge is a line through its thickness map. Pixels are sorted by their distance from it, in bins finer than a
 pixel: any blur is alike all along the edge, and moves whole bins. What pixels of one bin differ by is neither blur nor anything
-else that an effect does there; it is noise, roughness of the edge, and how a map draws the pixels that the border cuts.
+else that an effect does there; it is noise, roughness of the edge, and how a map draws the pixels that the border cuts. The border of
+a disc is the circle of its area about its centroid.
 
 Source: ISO 12233:2017 (slanted edge, four bins a pixel); IEC 62220-1-1:2015.
 """
@@ -22,6 +23,8 @@ _STRAIGHT_PX = 0.4  # rms of the border about a line; a border that runs between
 _LEAST_LINES = 16  # that cross the border: its place is then known to 0.29 / 4 px
 _LEAST_CUT = 0.02  # of a pixel, from which a border cuts it
 _MOST_CUT = 3.0  # pixels of a line: a step, even a worn one, and no slope
+_LEAST_RADIUS_PX = 4.0  # of a disc, whose border is then straight to 1 / 32 px within a pixel
+_ROUND_PX = 0.6  # from the border, beyond which no pixel of a disc's map is on the wrong side
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,16 +50,49 @@ def distance_px(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[np.
     return None if border is None else border.away_px
 
 
-def straight_scene(thickness_mm: Mapping[str, NDArray[np.floating]]) -> dict[str, NDArray[np.floating]] | None:
-    """Maps (row, column) of the same edge with pixels as thick as the share of them that it covers; None: there is no such edge."""
+def covered_scene(
+    kind: str | None, thickness_mm: Mapping[str, NDArray[np.floating]]
+) -> dict[str, NDArray[np.floating]] | None:
+    """Maps (row, column) of the same scene with pixels as thick as the share of them that it covers.
+
+    None where the scene is of another kind than `edge` or `disc`, or its border neither straight nor round.
+    """
+    covered = {"edge": _behind_line, "disc": _within_circle}.get(kind or "", lambda _: None)(thickness_mm)
+    if covered is None:
+        return None
+    ((name, image),) = thickness_mm.items()
+    return {name: (covered * float(np.max(image))).astype(np.float32)}
+
+
+def _behind_line(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[np.float64] | None:
+    """Covered share of each pixel (row, column) of a straight edge."""
     border = _border(thickness_mm)
     if border is None:
         return None
     length, sides = math.hypot(1.0, border.slope), sorted((1.0, max(abs(border.slope), 1e-4)))
     short, long = (np.full(border.away_px.shape, side / length) for side in sides)
-    covered = area_beyond(-border.behind * border.away_px, long, short)
-    ((name, image),) = thickness_mm.items()
-    return {name: (covered * float(np.max(image))).astype(np.float32)}
+    return area_beyond(-border.behind * border.away_px, long, short)
+
+
+def _within_circle(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[np.float64] | None:
+    """Covered share of each pixel (row, column) of a round disc that lies whole in the field."""
+    if len(thickness_mm) != 1:
+        return None
+    (image,) = (np.asarray(one, dtype=np.float64) for one in thickness_mm.values())
+    most = float(image.max(initial=0.0))
+    if not most > 0.0:
+        return None
+    share = image / most
+    area = float(share.sum())
+    radius = math.sqrt(area / math.pi)
+    row, column = np.ogrid[: image.shape[0], : image.shape[1]]
+    down, right = row - float(np.sum(share * row)) / area, column - float(np.sum(share * column)) / area
+    away = np.hypot(down, right) - radius
+    wrong = (share > 0.5) != (away < 0.0)
+    if radius < _LEAST_RADIUS_PX or np.any(np.abs(away[wrong]) > _ROUND_PX):
+        return None
+    sides = np.abs(np.stack(np.broadcast_arrays(down, right))) / np.maximum(away + radius, 1e-9)
+    return area_beyond(away, np.maximum(sides.max(axis=0), 1e-4), np.maximum(sides.min(axis=0), 1e-4))
 
 
 def _border(thickness_mm: Mapping[str, NDArray[np.floating]]) -> _Border | None:

@@ -67,8 +67,8 @@ def _of_its_own(model: ForwardModel, probes: SeriesProbes, signal: NDArray[np.fl
         images |= _of_spot(declared_spot_px(model.base, item.request), dy, dx)
         if model.sharp:
             images |= _between_points(item, signal)
-        if redrawn.straight is not None:
-            images[f"straight border of {_place(item)}"] = redrawn.straight
+        if redrawn.covered is not None:
+            images[f"border of {_place(item)}"] = redrawn.covered
     return columns | _projected(probes, images)
 
 

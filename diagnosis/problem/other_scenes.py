@@ -1,4 +1,4 @@
-"""Scenes as they may be instead: a material thicker, a straight border where it runs between the points of a map."""
+"""Scenes as they may be instead: a material thicker, a border where it runs between the points of a map."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..model import changes as scales
 from ..model.point_maps import sampled_at_points
 from ..model.responses import Asked, Moved, SeriesModel, SessionModel
-from ..probes.straight_edge import straight_scene
+from ..probes.straight_edge import covered_scene
 from ..session.even_maps import Map
 
 _Maps = Mapping[str, NDArray[np.floating]]
@@ -19,18 +19,18 @@ _Maps = Mapping[str, NDArray[np.floating]]
 class OtherScenes:
     """Thickness maps (row, column), mm, of what may stand in a scene's place.
 
-    Fields: thicker: with one material thicker by THICKNESS_SD, by that material; straight: with a straight border drawn by the share
-    of each pixel that it covers; None: the maps show none, or have it so.
+    Fields: thicker: with one material thicker by THICKNESS_SD, by that material; covered: with a straight or round border drawn by
+    the share of each pixel that it covers; None: the maps show none, or have it so.
     """
 
     thicker: Mapping[str, _Maps]
-    straight: _Maps | None
+    covered: _Maps | None
 
     def drawn(self, session: SessionModel, one: SeriesModel, asked: Asked) -> "Redrawn":
         """What each shows in a series under a change, less what its own scene shows there."""
         return Redrawn(
             thicker={material: session.with_scene(one, maps, asked) for material, maps in self.thicker.items()},
-            straight=None if self.straight is None else session.with_scene(one, self.straight, asked)[0],
+            covered=None if self.covered is None else session.with_scene(one, self.covered, asked)[0],
         )
 
 
@@ -39,10 +39,10 @@ class Redrawn:
     """What other scenes show in a series, by the fields of `OtherScenes`; maps (row, column), DN."""
 
     thicker: Mapping[str, Moved]
-    straight: Map | None
+    covered: Map | None
 
 
-NO_SCENES = OtherScenes(thicker={}, straight=None)
+NO_SCENES = OtherScenes(thicker={}, covered=None)
 
 
 def other_scenes(series: Sequence[SeriesModel]) -> dict[str, OtherScenes]:
@@ -56,13 +56,12 @@ def other_scenes(series: Sequence[SeriesModel]) -> dict[str, OtherScenes]:
         asked = one.session.request
         maps = asked.thickness_mm or {}
         if id(asked.thickness_mm) not in known:
-            edge = asked.scene_kind == "edge" and sampled_at_points(maps)
             known[id(asked.thickness_mm)] = OtherScenes(
                 thicker={
                     material: {name: image * factor if name == material else image for name, image in maps.items()}
                     for material in maps
                 },
-                straight=straight_scene(maps) if edge else None,
+                covered=covered_scene(asked.scene_kind, maps) if sampled_at_points(maps) else None,
             )
         result[one.name] = known[id(asked.thickness_mm)]
     return result

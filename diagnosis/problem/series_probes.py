@@ -20,7 +20,7 @@ from ..probes.frame_scalars import measured_scalars
 from ..probes.map_probes import MapProjection, Template, edge_templates, smooth_templates, transmission_templates
 from ..probes.probes import ProbeName, Scalar
 from ..probes.registration import RENDER_SHARE, render_variance
-from ..probes.straight_edge import distance_px, scatter_share, straight_scene
+from ..probes.straight_edge import covered_scene, distance_px, scatter_share
 from ..session.even_maps import Map, full_size, local_range, near_steps, signal_map
 from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
 
@@ -251,9 +251,10 @@ def series_probes(
     )
     scalars = [probe for probe in scalars if probe.name in one.scalars]
     if one.placement is not None and one.tells_displacement:
-        maps = one.session.request.thickness_mm or {}
-        # a slanted border meets the pixels everywhere, so that where it lies between them averages out
-        between = sampled_at_points(maps) and straight_scene(maps) is None
+        request = one.session.request
+        maps = request.thickness_mm or {}
+        # a slanted or round border meets the pixels everywhere, so that where it lies between them averages out
+        between = sampled_at_points(maps) and covered_scene(request.scene_kind, maps) is None
         scalars += displacement_probes(one.placement, between_points=between)
     # noise of lines that is no effect stands in the mean frame as well
     beyond = np.asarray(session.usual_lines(one.session)) @ projection.line_noise()

@@ -306,6 +306,9 @@ def _change(
     target = difference.reshape(-1)
     use = np.ones(target.size, dtype=bool)
     scale = np.linalg.norm(matrix, axis=0) + 1e-30
+    # behind opaque things a counter counts nothing, and that tells no noise of what is beside them
+    alive = (earlier.reshape(-1) != 0.0) | (later.reshape(-1) != 0.0)
+    alive = alive if alive.any() else use
     solution = np.zeros(len(design))
     for _ in range(3):
         # by normal equations: a few unknowns and thousands of blocks
@@ -313,9 +316,9 @@ def _change(
         gram = rows_in_use.T @ rows_in_use
         solution = np.linalg.lstsq(gram, rows_in_use.T @ target[use], rcond=1e-11)[0] / scale
         left = target - matrix @ solution
-        spread = 1.4826 * float(np.median(np.abs(left[use])))
+        spread = 1.4826 * float(np.median(np.abs(left[use & alive])))
         use = np.abs(left) <= max(5.0 * spread, 1e-12)
-        if use.sum() < 2 * len(design):
+        if np.count_nonzero(use & alive) < 2 * len(design):
             break
     left = (target - matrix @ solution).reshape(difference.shape)
     level = shape = 0.0
@@ -324,7 +327,7 @@ def _change(
         surface = np.tensordot(solution[:count], terms, 1)
         smooth = surface * middle + solution[count]
         # what noise alone gives to the coefficients, so that only more than that is a change
-        spread = 1.4826 * float(np.median(np.abs(left))) * noise_growth / math.sqrt(left.size)
+        spread = 1.4826 * float(np.median(np.abs(left.reshape(-1)[alive]))) * noise_growth / math.sqrt(left.size)
         by_noise = spread**2 * float(chdtri(len(design), FALSE_ALARM))
         shape = math.sqrt(max(float(np.var(smooth - level * middle)) - by_noise, 0.0)) / signal
         level = math.copysign(max(abs(level) - _two_sided_limit(FALSE_ALARM) * spread / signal, 0.0), level)
@@ -353,7 +356,9 @@ def _judged(
     local = _four_mean(np.abs(means.mean(axis=0)))
     mixed = _mixed(left)
     consecutive = max(len(moving), 1)
+    # what the smooth surface itself has of the noise is left where there is none
     noise = _variance_law(mixed[:consecutive], local)
+    noise = np.maximum(noise, float(noise.max()) * len(terms) / terms[0].size)
     pattern_DN = PATTERN_CHANGE * local if lit else np.full(local.shape, DARK_PATTERN_SIGMAS * sigma_DN)
     variance = noise + 4.0 * pattern_DN**2
     tests = mixed.size
@@ -368,11 +373,13 @@ def _judged(
     level = max((item.level for item in changes), key=abs, default=0.0)
     smooth = max(item.shape for item in changes)
     lines_DN = np.array([item.lines_DN for item in changes])
-    odd_lines = lines_DN > LINE_SIGMAS * math.sqrt(2.0) * sigma_DN
+    # of a pixel where it is brightest (mixed differences hold the noise of eight blocks): lines run through light and shadow
+    brightest_DN = max(sigma_DN, block * math.sqrt(float(noise.max()) / 8.0))
+    odd_lines = lines_DN > LINE_SIGMAS * math.sqrt(2.0) * brightest_DN
     if len(moving) >= _ENOUGH_PAIRS:
         # row noise is in every pair: what jumps once is no noise
         usual = float(np.median(lines_DN[: len(moving)]))
-        jumps = lines_DN > max(_JUMPS * usual, LINE_JUMP_SIGMAS * math.sqrt(2.0) * sigma_DN)
+        jumps = lines_DN > max(_JUMPS * usual, LINE_JUMP_SIGMAS * math.sqrt(2.0) * brightest_DN)
         odd_lines |= jumps & (np.arange(len(pairs)) < len(moving))
     most = max(_SPECK_SHARE * places.size, _SPECKS * _TESTS_A_SPECK)
     change: SceneChange | None = None

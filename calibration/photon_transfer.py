@@ -493,7 +493,9 @@ def spread_estimate(fit: SpreadFit) -> SpreadEstimate:
         family=fit.family,
         others=fit.others,
         intervals={
-            name: estimate_from_sd(getattr(fit.spread, name), sd, lowest=0.0)
+            name: estimate_from_sd(
+                getattr(fit.spread, name), sd, lowest=0.0, highest=1.0 if name == "tail_share" else math.inf
+            )
             for name, sd in fit.spread_sd.items()
             if name == "sigma_px" or sd > 0
         },

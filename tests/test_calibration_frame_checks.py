@@ -90,6 +90,18 @@ def test_light_that_strays_into_a_shadow_without_noise_is_one_scene(share):
     assert same_scene([np.array(frames).astype(np.uint16)], offset_DN=DARK_DN).same is False
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_counter_that_counts_nothing_in_a_shadow_shows_one_scene(seed):
+    """Half of the field is silent: what noise there is beside it is no change of lines or edges."""
+    rng = np.random.default_rng(seed)
+    opaque = np.add.outer(0.06 * np.arange(88), np.arange(104)) > 50.0
+    counts = rng.poisson(np.where(opaque, 0.0, 9000.0), (12, 88, 104)).astype(np.uint16)
+    assert same_scene([counts]).same
+    moved = counts.copy()
+    moved[6:] = np.roll(moved[6:], 2, axis=2)
+    assert same_scene([moved]).change == SceneChange.STRUCTURE
+
+
 @pytest.mark.parametrize("signal", [1.0, 4.0, 16.0])
 def test_dim_frames_whose_structure_is_noise_alone_are_one_scene(signal):
     """A frame that is judged by its own noise seems to fall back to the mean in the next one."""

@@ -80,10 +80,10 @@ class Estimate:
         return {"value": self.value, "low": self.low, "high": self.high}
 
 
-def estimate_from_sd(value: float, sd: float, *, lowest: float = -math.inf) -> Estimate:
-    """Gaussian 95 % interval about `value`, cut at `lowest`."""
+def estimate_from_sd(value: float, sd: float, *, lowest: float = -math.inf, highest: float = math.inf) -> Estimate:
+    """Gaussian 95 % interval about `value`, cut at `lowest` and `highest`."""
     half = Z95 * sd
-    return Estimate(value=value, low=min(max(value - half, lowest), value), high=value + half)
+    return Estimate(value=value, low=min(max(value - half, lowest), value), high=max(min(value + half, highest), value))
 
 
 def estimate_from_log_draws(logarithm: NDArray[np.float64], relative_sd: float) -> Estimate:

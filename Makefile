@@ -1,6 +1,6 @@
 # make demo   the main job end to end, report in demo/report.html
 # make table  the paper's table, some hours, page in table/report.html
-# make test   the default test suite (a quarter of an hour on 2 cores)
+# make test   the default test suite (some ten minutes on 2 cores)
 # make docs   the documentation site, tutorials executed, in docs/_build/html (extra `docs`)
 # make check  lint, types, import directions (fast)
 PYTHON ?= python3

@@ -258,7 +258,7 @@ def _read_rows(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
     kept = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
     if len(kept) < 2:
         raise FileFormatError(
-            "table", received=f"{path} with {len(kept)} lines", expected="a header and rows of trials"
+            "table", received=f"{path} with {counted(len(kept), 'line')}", expected="a header and rows of trials"
         )
     first = kept[0][1]
     separator = max(",;\t", key=first.count)
@@ -289,7 +289,7 @@ def _read_rows(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
     for number, row in zip(numbers, cells[1:], strict=False):
         if len(row) != len(header):
             raise FileFormatError(
-                f"table line {number}", received=f"{len(row)} columns", expected=f"{len(header)} as in the header"
+                f"table line {number}", received=counted(len(row), "column"), expected=f"{len(header)} as in the header"
             )
     body = cells[1:]
     if separator != ",":

@@ -58,7 +58,7 @@ def text_from_answer(result: dict[str, Any], size_name: str) -> str:
         )
     lines += _further_lines(result)
     joined = result.get("over_links")
-    if joined and len(joined["curves"]) > 1:
+    if joined and len(joined["curves"]) > 1 and joined["a90_lowest"] is not None:
         lines.append(
             f"over {', '.join(joined['curves'])} (AIC within 2 of the best, and the one chosen): a90 {shown(joined['a90_lowest'])} to"
             f" {shown(joined['a90_highest'])}, a90/95 {shown(joined['a90_95'])}, two-sided 95 % {shown(joined['a90_low'])} to"

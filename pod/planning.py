@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import FitError, InputError
+from ..errors import FitError, InputError, check_number
 from .hit_miss import fit_pooled, trusted_bound
 from .links import Link, link_from_name
 from .mixed import averaged_eta, averaged_pod
@@ -48,6 +48,8 @@ class AssumedCurve:
 
     def __post_init__(self) -> None:
         link_from_name(self.link)
+        for name in ("a50", "a90", "sd_network", "sd_image"):
+            check_number(name, getattr(self, name))
         if not (math.isfinite(self.a50) and math.isfinite(self.a90) and self.a90 > self.a50):
             raise InputError("a50 and a90", received=f"{self.a50:g} and {self.a90:g}", expected="an a90 above the a50")
         if self.log_size and not self.a50 > 0:

@@ -506,6 +506,7 @@ def test_recommended_sizes_beat_sizes_made_at_random():
         (lambda: AssumedCurve(a50=1, a90=2, sd_image=-1), "a finite spread of 0 or more"),
         (lambda: AssumedCurve(a50=1, a90=2, link="log"), "link"),
         (lambda: plan_pod(AssumedCurve(a50=1, a90=2), wanted_over_a90=0.9), "a ratio above 1"),
+        (lambda: AssumedCurve(a50="1", a90=2), "a50: got '1'; expected a number"),
         (lambda: expected_precision(AssumedCurve(a50=1, a90=2), [1, 1]), "two or more different, finite sizes"),
         (lambda: expected_precision(AssumedCurve(a50=1, a90=2), [1, 2], networks=0), "networks"),
         (lambda: recommended_sizes(AssumedCurve(a50=1, a90=2), 1), "images"),

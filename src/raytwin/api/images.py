@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from ..errors import FileFormatError, InputError
+from ..errors import FileFormatError, InputError, check_number
 from ..results import Result, Table, axes_or_new, counted, frame, plain
 from ._given import PathLike, as_twin, dataset_of, twin_sha256, whole_seed
 from ._progress import Progress, Telling
@@ -351,6 +351,7 @@ def generate(
     from ..generator.predictions.predict_settings import as_setting
     from ..materials import material_from_name
 
+    check_number("n", n)
     known, targets = as_twin(twin), (as_setting(low), as_setting(high))
     material_from_name(product_material)
     material_from_name(foreign_material)

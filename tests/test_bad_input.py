@@ -169,7 +169,10 @@ EDITS = {
     "negative exposure": (lambda file: file["series/flat_40_20"].attrs.modify("exposure_ms", -20.0), "exposure_ms"),
     "NaN exposure": (lambda file: file["series/flat_40_20"].attrs.modify("exposure_ms", np.nan), "exposure_ms"),
     "zero kV": (lambda file: file["series/flat_40_20"].attrs.modify("kV", 0.0), "kV"),
-    "kV above the table": (lambda file: file["series/flat_40_20"].attrs.modify("kV", 900.0), "kV"),
+    "kV above the table": (
+        lambda file: file["series/flat_40_20"].attrs.modify("kV", 900.0),
+        "series flat_40_20: kV: got 900 kV; expected 10 to",
+    ),
     "negative current": (lambda file: file["series/flat_40_20"].attrs.create("current_mA", -1.0), "current_mA"),
     "unknown kind": (lambda file: file["series/flat_40_20"].attrs.modify("kind", "flaat"), "flaat"),
     "unknown filter material": (

@@ -17,6 +17,7 @@ from raytwin.diagnosis.session.binned_twin import binned_twin
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.frames.line_model import LineModel
 from raytwin.generator.line.series_request import SeriesRequest
+from raytwin.generator.spread.psf import Spread
 from raytwin.generator.twins.twin_io import read_twin
 
 pytestmark = pytest.mark.slow
@@ -101,6 +102,15 @@ def test_lengths_of_its_effects_are_in_squares(series_line):
     assert small[2].parameters["reach_px"] > 0.0
     assert small[3].parameters["strength"] == 100.0
     assert small[4:] == had[4:]
+
+
+@pytest.mark.parametrize("axes", ["both", "row"])
+def test_a_square_has_what_the_spread_leaves_in_it_along_its_axes(series_line, axes):
+    spread = replace(series_line.noise.spread, value=Spread(sigma_px=0.9, axes=axes))
+    fine = replace(series_line, noise=replace(series_line.noise, spread=spread))
+    found = binned_twin(fine, 2).noise.spread.value
+    assert found.axes == axes
+    assert found.variance_share == pytest.approx(spread.value.binned_variance_share(2), rel=1e-6)
 
 
 def test_a_panel_without_pitch_keeps_its_level(series_line):

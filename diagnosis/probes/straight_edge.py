@@ -76,16 +76,12 @@ def _behind_line(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[np
 
 def _within_circle(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[np.float64] | None:
     """Covered share of each pixel (row, column) of a round disc that lies whole in the field."""
-    if len(thickness_mm) != 1:
+    share = _of_the_thickest(thickness_mm)
+    if share is None:
         return None
-    (image,) = (np.asarray(one, dtype=np.float64) for one in thickness_mm.values())
-    most = float(image.max(initial=0.0))
-    if not most > 0.0:
-        return None
-    share = image / most
     area = float(share.sum())
     radius = math.sqrt(area / math.pi)
-    row, column = np.ogrid[: image.shape[0], : image.shape[1]]
+    row, column = np.ogrid[: share.shape[0], : share.shape[1]]
     down, right = row - float(np.sum(share * row)) / area, column - float(np.sum(share * column)) / area
     away = np.hypot(down, right) - radius
     wrong = (share > 0.5) != (away < 0.0)
@@ -95,14 +91,20 @@ def _within_circle(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[
     return area_beyond(away, np.maximum(sides.max(axis=0), 1e-4), np.maximum(sides.min(axis=0), 1e-4))
 
 
-def _border(thickness_mm: Mapping[str, NDArray[np.floating]]) -> _Border | None:
+def _of_the_thickest(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[np.float64] | None:
+    """The map of a scene of one material (row, column), over its largest value; None of any other scene."""
     if len(thickness_mm) != 1:
         return None
     (image,) = (np.asarray(one, dtype=np.float64) for one in thickness_mm.values())
     most = float(image.max(initial=0.0))
-    if not most > 0.0:
+    return image / most if most > 0.0 else None
+
+
+def _border(thickness_mm: Mapping[str, NDArray[np.floating]]) -> _Border | None:
+    share = _of_the_thickest(thickness_mm)
+    if share is None:
         return None
-    across_rows, across_columns = _across_rows(image / most), _across_rows(image.T / most)
+    across_rows, across_columns = _across_rows(share), _across_rows(share.T)
     if across_columns is None or (across_rows is not None and across_rows.lines >= across_columns.lines):
         return across_rows
     return replace(across_columns, away_px=across_columns.away_px.T)

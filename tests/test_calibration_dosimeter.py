@@ -285,6 +285,7 @@ def test_a_reading_a_thousand_times_too_large_is_named_and_left_out(tmp_path):
     assert filtration.low <= FILTRATION_MM_AL <= filtration.high
 
 
+@pytest.mark.slow
 def test_a_slip_of_units_in_a_dose_table_is_named_and_bends_no_filtration(tube, tmp_path):
     """Kerma in mGy: a common factor, which says nothing of the spectrum."""
     rows = [(*row[:4], f"{0.001 * float(row[4]):.6g}", 1) for row in dose_rows(SETTINGS)]

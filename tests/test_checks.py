@@ -99,6 +99,7 @@ def panel_of_bad_pixels(broken, tmp_path):
     return tmp_path / "session.h5"
 
 
+@pytest.mark.slow
 def test_stuck_and_wildly_noisy_pixels_make_no_flat_saturated_and_no_scene_change(broken, panel_of_bad_pixels):
     """Both show in the darks, and no panel is without them; a flat that saturates is told all the same."""
     found = [(finding.code, finding.series) for finding in check_acquisition(panel_of_bad_pixels).findings]

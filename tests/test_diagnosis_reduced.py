@@ -79,6 +79,7 @@ def test_lines_move_later_means_by_chance_and_places_of_scenes_follow_no_law(lin
     assert seen == {(share, since) for share in (0.0, 1.0) for since in ("always", "calibration")}
 
 
+@pytest.mark.slow
 def test_scenes_that_all_lie_elsewhere_are_seen_as_a_family_of_their_own(line):
     with open_acquisition(line / "session.h5") as acquisition:
         problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=())

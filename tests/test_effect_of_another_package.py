@@ -92,6 +92,7 @@ def answer(tmp_path_factory):
     return json.loads(run.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_an_effect_of_another_package_is_predicted_and_drawn_into_images(answer):
     assert answer["last"] == "worn_screen"  # after ours
     # light spreads over the border of what is worn

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
+from scipy.signal import fftconvolve
 
 from raytwin.acquisition.setting import Filter, filters_from_text, setting_from_text
 from raytwin.errors import InputError
@@ -404,6 +405,28 @@ def test_a_session_s_strength_is_that_at_the_middle_of_its_beams(series_line):
 def test_scatter_of_the_same_width_at_any_gap_is_as_strong_there(series_line):
     near, far = (water_slab(series_line, 20.0, mm, gap_exponent=0.0)[20, 20] for mm in (990.0, 500.0))
     assert near == pytest.approx(far, rel=1e-6)
+
+
+@pytest.mark.parametrize("own", [0.0, 1.0])
+def test_where_the_beam_goes_on_beyond_the_detector_an_even_slab_scatters_alike_everywhere(series_line, own):
+    ratio = water_slab(series_line, 20.0, energy_exponent=0.0, beyond=1.0, own_directions=own)
+    np.testing.assert_allclose(ratio, 0.20, rtol=0.005)
+
+
+def test_what_scatters_beyond_the_borders_is_what_stands_at_them(series_line):
+    water_mm = np.tile(30.0 * np.linspace(0, 1, SHAPE[1]) ** 2, (SHAPE[0], 1))
+    usual_mm = series_line.instrument.source_object_mm
+    asked = request("object", thickness_mm={"water_liquid": water_mm}, source_object_mm=usual_mm)
+    primary, beam = expect(series_line, asked).signal_DN, expect(series_line, request()).signal_DN
+    height_mm, around = 3.0, 20_000
+    scatter = applied("object_scatter", 20.0, width_mm=1.533 * height_mm, beyond=1.0)
+    scattered = (expect(series_line, asked, scatter).signal_DN - primary) / beam
+    # along lines that are alike the kernel is the angle under which a pixel is seen
+    source = np.pad((primary * np.log(beam / primary)).mean(axis=0), around, mode="edge")
+    place_mm = series_line.instrument.pixel_mm * np.arange(-around, around + 1)
+    spread = fftconvolve(source, 1.0 / (height_mm**2 + place_mm**2), mode="same")[around:-around]
+    found = scattered.mean(axis=0)
+    np.testing.assert_allclose(found / found.mean(), spread / spread.mean(), rtol=0.02)
 
 
 def test_without_an_albedo_of_its_own_a_metal_scatters_as_much_as_it_attenuates(series_line):

@@ -384,6 +384,7 @@ def transfers(twin):
     return {name: PairTransfer(twin, low=low, high=high) for name, (low, high) in TARGETS.items()}
 
 
+@pytest.mark.slow
 @hypothesis_settings(max_examples=12)
 @example(seed=0, low=11.0, high=9.0, scatter=0.5, name="other kV")
 @given(

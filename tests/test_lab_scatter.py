@@ -128,6 +128,7 @@ def test_more_collisions_only_add_and_count_for_more_in_thick_objects():
     assert not once[1].any() and once[0].sum() == pytest.approx(thick[0].sum(), rel=0.02)
 
 
+@pytest.mark.slow
 def test_compton_scatter_loses_energy_and_none_is_gained():
     energies = LOWEST_KEV + STEP_KEV * np.arange(scattered_by({"water": 20.0}).shape[3])
     spectrum = scattered_by({"water": 20.0}).sum(axis=(0, 1, 2))

@@ -15,7 +15,8 @@ p is water's share of scattered photons into a direction, per sr, of the beam be
 (half of a product); `own_directions` w = 0 has all directions alike (then K is half as high at R = 0.77 h), w = 1 those of
 free atoms, with h = g for what stands nowhere else than in the air gap. One law for the gap: h grows as a power
 (`gap_exponent`, 1: in proportion) of g, and what all directions get stays, so that what a field of finite size catches
-falls by itself. Only the field that the detector covers is irradiated. Photons that scatter more than once are not counted
+falls by itself. `beyond` is how much of what stands at the borders of the picture goes on beyond them and scatters there: 0, the
+beam is collimated to the detector; 1, it is far wider. Photons that scatter more than once are not counted
 apart: behind 20 mm of water the virtual lab has 3-7 % of them (40 and 90 kV, 100 and 350 mm of air), spread more evenly.
 """
 
@@ -42,12 +43,15 @@ _WATER_MM = 20.0
 _BORDER_DEPTH = 1.0  # range of optical depth across 3 x 3 pixels from which a pixel cannot be told by its mean
 _ENERGIES = 6  # that stand for a beam where directions depend on them
 _COARSE = 48  # cells a side: the kernel is broad, so the convolution is done on block means
+_COARSE_BEYOND = 24  # of what comes from beyond the borders, which is smoother
+_STRIPS = 10  # beyond a border, each twice as wide as the last one, and the last one without an end
+_ENDLESS_MM = 1e7
 
 
-@lru_cache(maxsize=8)
-def _block_means(length: int) -> tuple[FloatArray, FloatArray, float]:
+@lru_cache(maxsize=16)
+def _block_means(length: int, most: int = _COARSE) -> tuple[FloatArray, FloatArray, float]:
     """(block mean (cell, pixel), linear interpolation back (pixel, cell), pixels a cell) along one axis."""
-    cells = min(_COARSE, length)
+    cells = min(most, length)
     edges = np.linspace(0.0, length, cells + 1)
     pixel = np.arange(length)
     overlap = np.minimum(pixel[None, :] + 1.0, edges[1:, None]) - np.maximum(pixel[None, :], edges[:-1, None])
@@ -72,7 +76,9 @@ class _Kernel:
     energies_keV: tuple[float, ...]
     gap_mm: float
 
-    def cell(self, y_mm: FloatArray, x_mm: FloatArray, up_mm: float, left_mm: float) -> FloatArray:
+    def cell(
+        self, y_mm: FloatArray, x_mm: FloatArray, up_mm: FloatArray | float, left_mm: FloatArray | float
+    ) -> FloatArray:
         """Its integral over cells of half sides `up_mm` and `left_mm` about (y, x)."""
         alike = sum(
             sign_y * sign_x * _corner(y_mm + sign_y * up_mm, x_mm + sign_x * left_mm, self.height_mm)
@@ -107,6 +113,48 @@ def _spread(field: FloatArray, pitch_mm: float, kernel: _Kernel) -> FloatArray:
     wide = np.fft.rfft2(coarse, s=doubled, axes=(-2, -1)) * transform
     spread = np.fft.irfft2(wide, s=doubled, axes=(-2, -1))[..., : shape[0], : shape[1]]
     return np.asarray(row_back @ spread @ column_back.T)
+
+
+@lru_cache(maxsize=64)
+def _from_beyond(shape: tuple[int, int], cell_mm: tuple[float, float], kernel: _Kernel) -> FloatArray:
+    """What each cell of a field (row, column) gets of what goes on beyond its borders (row, column, 4 + 2 rows + 2 columns).
+
+    Each border cell goes on straight outwards, each of the corners over a quarter of the plane. Order: corners, then rows at the
+    left and right border, then columns at the upper and lower one.
+    """
+    (rows, columns), (high, wide) = shape, cell_mm
+    outwards = np.append(kernel.height_mm / 8.0 * (2.0 ** np.arange(_STRIPS) - 1.0), _ENDLESS_MM)
+    middle, half = 0.5 * (outwards[1:] + outwards[:-1]), 0.5 * np.diff(outwards)
+    y, x = (np.arange(rows) + 0.5) * high, (np.arange(columns) + 0.5) * wide
+    up, down = y[:, None] + middle, rows * high - y[:, None] + middle  # from each cell (cell, strip)
+    left, right = x[:, None] + middle, columns * wide - x[:, None] + middle
+    along_y, along_x = y[:, None] - y, x[:, None] - x
+
+    found = [
+        kernel.cell(one[:, None, :, None], two[None, :, None, :], half[:, None], half).sum(axis=(2, 3))[:, :, None]
+        for one in (up, down)
+        for two in (left, right)
+    ]
+    found += [
+        kernel.cell(along_y[:, None, :, None], two[None, :, None, :], 0.5 * high, half).sum(axis=3)
+        for two in (left, right)
+    ]
+    found += [
+        kernel.cell(one[:, None, None, :], along_x[None, :, :, None], half, 0.5 * wide).sum(axis=3)
+        for one in (up, down)
+    ]
+    return np.concatenate(found, axis=2)
+
+
+def _beyond(field: FloatArray, pitch_mm: float, kernel: _Kernel) -> FloatArray:
+    """What maps (k, row, column) get of themselves by the kernel where they go on beyond their borders."""
+    row_mean, row_back, row_step = _block_means(field.shape[-2], _COARSE_BEYOND)
+    column_mean, column_back, column_step = _block_means(field.shape[-1], _COARSE_BEYOND)
+    coarse = row_mean @ field @ column_mean.T
+    corners = coarse[:, [0, 0, -1, -1], [0, -1, 0, -1]]
+    border = np.concatenate([corners, coarse[:, :, 0], coarse[:, :, -1], coarse[:, 0], coarse[:, -1]], axis=1)
+    gets = _from_beyond((coarse.shape[-2], coarse.shape[-1]), (row_step * pitch_mm, column_step * pitch_mm), kernel)
+    return np.asarray(row_back @ np.moveaxis(gets @ border.T, -1, 0) @ column_back.T)
 
 
 def _corner(y_mm: FloatArray, x_mm: FloatArray, height_mm: float) -> FloatArray:
@@ -215,6 +263,11 @@ def _add_scatter(state: LineState, parameters: Mapping[str, float], context: Lin
     field = _shared_at_borders(field, shared)
     scattered = _spread(field, pitch, here)
     centre = _share_at_centre(context.shape, pitch, at_usual_gap)
+    if parameters["beyond"] > 0.0:
+        scattered += parameters["beyond"] * _beyond(field, pitch, here)
+        even = np.ones((1, *context.shape))
+        around = _beyond(even, pitch, at_usual_gap)[0]
+        centre += parameters["beyond"] * float(around[tuple(length // 2 for length in context.shape)])
     behind_water = -np.log(float(behind.sum()) / float(weights.sum()))
     factor = parameters["strength"] / 100.0 / (behind_water * centre)
     factor *= (energy_keV / parameters["reference_keV"]) ** parameters["energy_exponent"]
@@ -285,6 +338,15 @@ OBJECT_SCATTER = Effect(
             log=False,
         ),
         Parameter(
+            name="beyond",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=0.0,
+            source="0: beam collimated to the detector; 1: what stands at the borders goes on beyond them, irradiated",
+            log=False,
+        ),
+        Parameter(
             name="reference_keV",
             unit="keV",
             low=5.0,
@@ -312,6 +374,7 @@ OBJECT_SCATTER = Effect(
             {"width_mm": 200.0},
             {"width_mm": 400.0, "own_directions": 1.0, "energy_exponent": -0.25},
             {"width_mm": 40.0, "energy_exponent": -0.8, "own_albedo": 0.0, "gap_exponent": 0.5},
+            {"width_mm": 100.0, "beyond": 1.0},
         ),
     ),
     # photons followed one by one reach shadows that no kernel fills: as a rule up to 3e-3 of its log evidence goes to another

@@ -17,10 +17,11 @@ def _lose_counts(state: LineState, parameters: Mapping[str, float], context: Lin
     light_DN, variance_DN2 = float(state.signal_DN.sum()), float(state.variance_DN2.sum())
     if parameters["strength"] == 0 or not context.request.beam_on or light_DN <= 0.0:
         return state
-    if not context.twin.instrument.counting:
+    counting = context.twin.instrument.counting
+    if not counting:
         raise InputError(
             "instrument counting",
-            received=context.twin.instrument.counting,
+            received="nothing" if counting is None else "false",
             expected="true, because only counters have a dead time",
             remedy="state it in the acquisition's instrument",
         )

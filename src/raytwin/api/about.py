@@ -6,7 +6,7 @@ import os
 import platform
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -111,8 +111,11 @@ class Exported(Result):
         return found
 
     def _table(self) -> Table:
-        notes = tuple(f"warning: {text}" for text in self.warnings)
-        return Table(title=f"{self.folder}, for {self.to}", rows=tuple(self.files.items()), notes=notes)
+        return replace(self.table(), notes=tuple(f"warning: {text}" for text in self.warnings))
+
+    def table(self) -> Table:
+        """The files, each with what it holds."""
+        return Table(title=f"{self.folder}, for {self.to}", rows=tuple(self.files.items()))
 
 
 def info(twin: "Twin | TubeTwin | PathLike | None" = None) -> "Info | Twin | TubeTwin":

@@ -77,5 +77,5 @@ def run(arguments: argparse.Namespace) -> int:
         )
     for line in found.warnings:
         say(f"warning: {line}")
-    answer(found.to_dict(), as_json=arguments.json, text=repr(found))
+    answer(found.to_dict(), as_json=arguments.json, text=found.table().as_text(lines=len(found.files) + 2))
     return 0

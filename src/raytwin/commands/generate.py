@@ -13,6 +13,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from ..results import counted
 from ._answer import answer, say
 from ._twin_file import HELP, twin_file
 
@@ -118,7 +119,7 @@ def _registration(text: str | None) -> tuple[float, float] | str | None:
 def _text(result: dict[str, Any], path: Path) -> str:
     return (
         f"{result['images']} image pairs ({result['with_foreign_object']} with a foreign object) from"
-        f" {result['references']} references at {result['setting']}\n"
+        f" {counted(result['references'], 'reference')} at {result['setting']}\n"
         f"seed {result['seed']}, recipe {result['recipe']}, SHA-256 {result['hashes']['dataset_sha256']}\n"
         f"dataset written to {path}"
     )

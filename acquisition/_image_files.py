@@ -275,6 +275,23 @@ def frame_dtype(image: NDArray[Any]) -> type[Any]:
     return np.uint16 if image.dtype in (np.uint8, np.uint16, np.bool_) else np.float32
 
 
+def number_in_cell(text: str | None, *, where: str) -> float:
+    """A number out of a table's cell; of an empty one NaN.
+
+    Raises:
+        InputError: a cell that is no number.
+    """
+    written = (text or "").strip()
+    try:
+        return float(written) if written else math.nan
+    except ValueError:
+        raise InputError(
+            where,
+            received=repr(written),
+            expected="a number with a decimal point, or nothing where it is unknown",
+        ) from None
+
+
 def number_or_nan(text: str | None) -> float:
     """A number out of a table's cell; empty or unreadable cells are NaN."""
     try:

@@ -67,7 +67,7 @@ from ._image_files import (
     RawLayout,
     frame_dtype,
     iter_images,
-    number_or_nan,
+    number_in_cell,
     read_image,
     read_mask,
 )
@@ -427,7 +427,7 @@ def _write_scene(
     }
     size_mm = number_of(table, "size_mm", where=where)
     if "size_mm" in known:
-        size_mm = number_or_nan(known["size_mm"])
+        size_mm = number_in_cell(known["size_mm"], where=f"{where}, size_mm")
     writer.add_scene(
         name,
         kind=text_of(table, "kind", where=where) or "product",

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
-from ._image_files import number_or_nan, read_image, read_mask
+from ._image_files import number_in_cell, read_image, read_mask
 from ._sidecar import NAME, check_words, instrument_of, raw_layout_of, read_sidecar, rows_of, starred, text_of
 from .acquisition_io import open_acquisition
 from .contrast import DILATIONS, PRODUCT_THRESHOLD, check_dilations, delta_r, dilations_for_pixel
@@ -214,6 +214,8 @@ def _from_images(folder: Path, out: str | os.PathLike[str], tables: Mapping[str,
             received=f"no image pair with mask ({skipped[0].what}: {skipped[0].reason})" if skipped else "no images",
             expected="files that match low, high and foreign_object_mask",
         )
+    known_names = patterns["low"].keys() | patterns["high"].keys()
+    skipped += [Skipped(what=f"row {name}", reason="no image of that name") for name in rows if name not in known_names]
     splits = {}
     if wanted.shares is not None:
         validation, test, rng = wanted.shares
@@ -300,7 +302,9 @@ def _row(
     notes: list[str],
 ) -> DatasetRow:
     has_object = foreign is not None and bool(foreign.any())
-    contrast = number_or_nan(known.get("contrast"))
+    contrast, size_mm = (
+        number_in_cell(known.get(word), where=f"{word} of image {name}") for word in ("contrast", "size_mm")
+    )
     if has_object and foreign is not None and math.isnan(contrast):
         try:
             contrast = delta_r(image[0], image[1], foreign, dilations=ring)
@@ -313,7 +317,7 @@ def _row(
         image=name,
         product=known.get("product") or name,
         foreign_object=(known.get("foreign_object") or "unnamed") if has_object else "",
-        size_mm=number_or_nan(known.get("size_mm")) if has_object else math.nan,
+        size_mm=size_mm if has_object else math.nan,
         contrast=contrast if has_object else math.nan,
         split=split,
     )

@@ -144,7 +144,13 @@ def fit_flat_noise(
     found += [(_power(item, total, dark_signal, good=good, estimator=estimator), -1) for item, total in darks.repeated]
     powers = [power for power, _ in found]
     groups = [group for _, group in found]
-    in_fit = [item.signal_DN > 0 or group < 0 for item, group in found]
+    counting = bool(acquisition.instrument.counting)
+    # darks of a counter without any count say what its declaration does: there is no electronic noise
+    in_fit = [
+        item.signal_DN > 0 if group >= 0 else not counting or float(np.nanmax(item.power_DN2)) > 0
+        for item, group in found
+    ]
+    silent = not any(keep for keep, group in zip(in_fit, groups, strict=True) if group < 0)
     warnings = [
         f"left out of the fit: {item.name} (no signal above dark)"
         for (item, _), keep in zip(stacks, in_fit, strict=False)
@@ -168,7 +174,7 @@ def fit_flat_noise(
     # darks that are single means bound the read noise by their difference
     means = [(total.mean_DN, total.frames * item.averaged) for item, total in darks.sums]
     most_read = most_read_variance(means, good) if darks.effective == 0 else None
-    if acquisition.instrument.counting and not darks.sums:
+    if counting and silent:
         most_read = 0.0  # a counter has no electronic noise
     instrument = acquisition.instrument
     lit = [power for power, group, keep in zip(powers, groups, in_fit, strict=True) if keep and group >= 0]

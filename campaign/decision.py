@@ -387,16 +387,17 @@ _COUNTED = {
 
 
 def decision_sentence(
-    verdicts: Sequence[Verdict], recommended: Verdict | None, requirement: Requirement, *, unit: str
+    verdicts: Sequence[Verdict], recommended: Verdict | None, requirement: Requirement, *, unit: str, tried: int
 ) -> str:
-    """What was decided, in plain words."""
+    """What was decided, in plain words; tried: how many settings networks were trained for."""
     asked = f"Asked for: {requirement_text(requirement, unit=unit)}."
     count = {kind: sum(one.verdict == kind for one in verdicts) for kind in _COUNTED}
     total = len(verdicts)
     parts = [_COUNTED[kind][number != 1].format(number) for kind, number in count.items() if number or kind == MEETS]
     tally = f"Of {total} setting{'s' * (total != 1)} {', '.join(parts)}."
     if recommended is None:
-        return f"{asked} {tally} None was tried; the reasons stand with the settings."
+        none = f"None of the {tried} that were tried has an a90" if tried else "None was tried"
+        return f"{asked} {tally} {none}; the reasons stand with the settings."
     facts = "; ".join(criterion_text(one, unit=unit) for one in recommended.criteria)
     if recommended.verdict == MEETS:
         return f"{asked} {tally} Take {recommended.label}: {facts}."
@@ -455,7 +456,9 @@ def decide(
     size_text = f"{requirement.size:g} {unit}" if unit else f"contrast {requirement.size:g}"
     return {
         "requirement": {**asdict(requirement), "pod": _POD, "confidence": _ONE_SIDED, "unit": unit},
-        "sentence": decision_sentence(verdicts, taken, requirement, unit=unit),
+        "sentence": decision_sentence(
+            verdicts, taken, requirement, unit=unit, tried=sum(bool(row.get("trained")) for row in rows)
+        ),
         "recommended": None if taken is None else taken.setting,
         "verdict": None if taken is None else taken.verdict,
         "meets": [one.setting for one in verdicts if one.verdict == MEETS],

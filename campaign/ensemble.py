@@ -70,6 +70,7 @@ def train_together(
     """
     from ..segmentation import finished_networks, open_runs, train_networks
     from ..segmentation._torch import load_torch
+    from ..segmentation.runs_io import gone_unless_begun
 
     for name, value in (("workers", workers), ("threads", threads)):
         if value < 1:
@@ -84,54 +85,57 @@ def train_together(
     if workers == 1:
         load_torch().set_num_threads(threads)
         return train_networks(dataset, folder, **words, progress=progress, warn=warn)
-    # what is wrong with folder, data or start shows here, before any process is started
-    train_networks(dataset, folder, **words, only=(), warn=warn)
-    runs = open_runs(folder)
-    done = set(finished_networks(runs))
-    left = [number for number in range(networks) if number not in done]
-    hands = [left[place::workers] for place in range(min(workers, len(left)))]
-    task = {
-        **words,
-        "recipe": dataclasses.asdict(recipe),
-        "dataset": str(Path(dataset.path).resolve()),
-        "folder": str(Path(folder).resolve()),
-        "start_from": None if start_from is None else str(start_from),
-        "threads": threads,
-    }
-    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(threads))
+    with gone_unless_begun(folder):
+        # what is wrong with folder, data or start shows here, before any process is started
+        train_networks(dataset, folder, **words, only=(), warn=warn)
+        runs = open_runs(folder)
+        done = set(finished_networks(runs))
+        left = [number for number in range(networks) if number not in done]
+        hands = [left[place::workers] for place in range(min(workers, len(left)))]
+        task = {
+            **words,
+            "recipe": dataclasses.asdict(recipe),
+            "dataset": str(Path(dataset.path).resolve()),
+            "folder": str(Path(folder).resolve()),
+            "start_from": None if start_from is None else str(start_from),
+            "threads": threads,
+        }
+        environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(threads))
 
-    def told() -> None:
-        from ..segmentation import read_result
+        def told() -> None:
+            from ..segmentation import read_result
 
-        if progress is None:
-            return
-        for number in sorted(set(finished_networks(runs)) - done):
-            done.add(number)
-            history = read_result(runs, number).history
-            progress(number, len(history), len(history), history[-1])
+            if progress is None:
+                return
+            for number in sorted(set(finished_networks(runs)) - done):
+                done.add(number)
+                history = read_result(runs, number).history
+                progress(number, len(history), len(history), history[-1])
 
-    children = Children()
-    with only_one(runs.path, "a training"), ThreadPoolExecutor(max_workers=max(1, len(hands))) as pool:
-        running: list[Future[None]] = [
-            pool.submit(children.run, "ensemble", given=json.dumps({**task, "only": numbers}), environment=environment)
-            for numbers in hands
-        ]
-        try:
-            waiting = set(running)
-            while waiting:
-                finished, waiting = wait(waiting, timeout=_LOOK_EVERY_S)
-                for future in finished:
-                    future.result()
-                told()
-        except BaseException as error:
-            children.stop()
-            if isinstance(error, ChildError):
-                raise RaytwinError(
-                    f"a process that trained networks in {folder} failed: {error}; what is trained is kept,"
-                    " and the same call goes on"
-                ) from None
-            raise
-        return train_networks(dataset, folder, **words, only=range(networks))
+        children = Children()
+        with only_one(runs.path, "a training"), ThreadPoolExecutor(max_workers=max(1, len(hands))) as pool:
+            running: list[Future[None]] = [
+                pool.submit(
+                    children.run, "ensemble", given=json.dumps({**task, "only": numbers}), environment=environment
+                )
+                for numbers in hands
+            ]
+            try:
+                waiting = set(running)
+                while waiting:
+                    finished, waiting = wait(waiting, timeout=_LOOK_EVERY_S)
+                    for future in finished:
+                        future.result()
+                    told()
+            except BaseException as error:
+                children.stop()
+                if isinstance(error, ChildError):
+                    raise RaytwinError(
+                        f"a process that trained networks in {folder} failed: {error}; what is trained is kept,"
+                        " and the same call goes on"
+                    ) from None
+                raise
+            return train_networks(dataset, folder, **words, only=range(networks))
 
 
 def main() -> int:

@@ -472,8 +472,10 @@ def _answer(
 
     decision = None
     if campaign.requirement is not None:
+        # where all have too many false alarms, the verdict on what a90 would take says so
+        closest = choose(rows, goal=goal, most_false_alarms=None) if choice.recommended is None else choice
         decision = decide(
-            rows, campaign.requirement, verdicts, recommended=choice.recommended, unit=unit, changes_by=changes_by
+            rows, campaign.requirement, verdicts, recommended=closest.recommended, unit=unit, changes_by=changes_by
         )
         said = decision["sentence"]
     else:

@@ -21,8 +21,8 @@ from ..acquisition.dataset_io import Dataset, read_dataset
 from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Setting, text_from_filters
 from ..errors import InputError
-from ..generator.effects import AppliedEffect
-from ..generator.effects.motion_blur import MOTION_BLUR, STATED_MS
+from ..generator.datasets.belt_motion import motion_strength_px, twin_on_belt
+from ..generator.effects.motion_blur import STATED_MS
 from ..generator.line.line_limits import frames_per_s
 from ..generator.line.twin import Twin
 from ..generator.predictions.predict import Prediction, predict_flatfield, saturation_text
@@ -139,7 +139,7 @@ class Scout:
         from ..generator.datasets.generate import ReferenceImages
         from ..generator.datasets.generate_described import channel_warnings, described_geometry
 
-        twin, told = twin_at(self.twin, pair)
+        twin, told = twin_on_belt(self.twin, pair)
         found: list[str] = list(told)
         for number, description in enumerate(self._descriptions):
             geometry = described_geometry(twin, description, low=pair[0], high=pair[1])
@@ -215,39 +215,6 @@ def limited_instrument(instrument: Instrument, limits: Limits) -> Instrument:
     if limits.readout_ms is not None:
         changes["readout_ms"] = max(limits.readout_ms, instrument.readout_ms or 0.0)
     return replace(instrument, **changes) if changes else instrument
-
-
-def motion_strength_px(instrument: Instrument, setting: Setting) -> float | None:
-    """Path (px) of the object's image in 50 ms on the belt, as the effect `motion_blur` states it; None where there is none.
-
-    v M 50 ms / pixel; of a TDI detector, whose charge moves along with the object, in one stage's share of that time.
-    """
-    if setting.belt_speed_mm_s is None or instrument.pixel_mm is None:
-        return None
-    magnification = instrument.magnification or 1.0
-    path = setting.belt_speed_mm_s * magnification * STATED_MS / 1000.0 / instrument.pixel_mm
-    return path / (instrument.tdi_stages or 1) if instrument.detector == "tdi" else path
-
-
-def twin_at(twin: Twin, pair: Pair) -> tuple[Twin, tuple[str, ...]]:
-    """The twin with the motion that the pair's belt speed makes in its images, and warnings.
-
-    A `motion_blur` of the twin itself, measured at the belt speed of its session, gives way to it.
-    """
-    strength = motion_strength_px(twin.instrument, pair[0])
-    if strength is None:
-        if pair[0].belt_speed_mm_s is not None:
-            return twin, ("the belt's motion is not in the images: the twin does not know its pixel pitch",)
-        return twin, ()
-    told = []
-    own = [item for item in twin.effects if item.id == MOTION_BLUR.id]
-    if own:
-        told.append("the twin's own motion blur gives way to that of the setting's belt speed")
-    if twin.instrument.belt_axis is None:
-        told.append("the belt is taken to move along the rows' index: the twin's belt_axis is not declared")
-    motion = AppliedEffect(id=MOTION_BLUR.id, parameters={"strength": strength}, since="calibration")
-    rest = tuple(item for item in twin.effects if item.id != MOTION_BLUR.id)
-    return replace(twin, effects=(*rest, motion)), tuple(told)
 
 
 def _motion_px(instrument: Instrument, pair: Pair) -> float | None:

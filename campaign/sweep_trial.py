@@ -30,7 +30,7 @@ from ..segmentation.recipe import STARTER
 from ._leash import line_from_parent
 from ._plain import canonical, digest, plain, read_object
 from .sweep_file import SIZES, Campaign, CurveOptions, Pair, Training, Trying, text_of_pair
-from .sweep_settings import open_references, start_pair, twin_at
+from .sweep_settings import open_references, start_pair
 from .trial import curve_of_table, detect_on_file, thresholds_from_images, train_on_file, write_split
 
 if TYPE_CHECKING:
@@ -412,11 +412,12 @@ def _of_other_size(curve: Mapping[str, Any]) -> dict[str, Any]:
 
 def _trial(task: Task, folder: Path, tell: Tell) -> dict[str, Any]:
     """Hit table of a setting; what was told on the way."""
+    from ..generator.datasets.belt_motion import twin_on_belt
     from ..generator.twins.twin_io import read_twin
 
     training, trying, seeds = task["training"], task["trying"], task["seeds"]
     pair = (setting_from_text(task["low"]), setting_from_text(task["high"]))
-    twin, told = twin_at(read_twin(task["twin"]), pair)
+    twin, told = twin_on_belt(read_twin(task["twin"]), pair)
     warnings = list(told)
     train, test, hits = folder / "train.h5", folder / "test.h5", folder / "hits.csv"
     tell("images")

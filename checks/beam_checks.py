@@ -105,8 +105,14 @@ def _shows_quanta(item: Reading, gain_DN: float, good: NDArray[np.bool_]) -> boo
     return clear and gain_DN / _ENERGY_RANGE < item.gain_DN < gain_DN * _ENERGY_RANGE
 
 
-def shadows_in_flats(judged: Sequence[Reading], good: NDArray[np.bool_]) -> list[Finding]:
-    """Flats whose brightness varies over the field as no other flat's does."""
+def shadows_in_flats(judged: Sequence[Reading], read_DN2: float, good: NDArray[np.bool_]) -> list[Finding]:
+    """Flats whose brightness varies over the field as no other flat's does.
+
+    Args:
+        judged: lit series.
+        read_DN2: variance of the darks, of a single exposure.
+        good: pixels that are looked at (row, column).
+    """
     flats = [item for item in judged if item.series.kind == "flat" and item.picture is not None]
     if len(flats) < 3:
         return []
@@ -117,8 +123,10 @@ def shadows_in_flats(judged: Sequence[Reading], good: NDArray[np.bool_]) -> list
             continue  # darks and read noise have a pattern of their own
         picture = np.maximum(np.asarray(item.picture), 1e-3)[good]
         low, high = np.quantile(np.log(picture), [0.05, 0.95])
-        photons = max(item.level_DN, 1e-9) * min(item.series.n_frames, FRAMES_READ)
-        noise = 3.3 * math.sqrt(item.gain_DN / photons) if item.gain_DN > 0 else 0.0
+        # of the mean frame and of the dark that was subtracted; nine pixels in ten lie within 3.3 standard deviations
+        single_DN2 = max(item.gain_DN, 0.0) * item.level_DN + read_DN2
+        mean_DN2 = single_DN2 / min(item.series.n_frames, FRAMES_READ) + read_DN2 / FRAMES_READ
+        noise = 3.3 * math.sqrt(mean_DN2) / max(item.level_DN, 1e-9)
         if high - low > _SHADOW_IN_FLAT + noise:
             percent = 100.0 * (1.0 - math.exp(low - high))
             found.append(Finding(code=FindingCode.SHADOW, series=item.name, values={"percent": percent}))

@@ -15,6 +15,8 @@ from ..generator.line.spectral_signal import OpenBeam, SpectralModel
 from .readings import FloatArray, Label, Reading
 
 INHERENT = PRIORS["inherent_filtration_mm_Al"]  # of a tube, beyond what is declared
+# from none to that of heavily filtered tubes, closer where spectra change faster
+INHERENT_TRIED_MM_AL = (*(0.25 * step for step in range(13)), 3.5, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0)
 _OPEN = 0.03  # -log T below which a pixel sees the open field
 DEEPEST = 4.0  # -log T beyond which nothing is compared
 
@@ -70,9 +72,9 @@ class LabelModel:
             return 0.0
         return math.log(max(float(bare[0].sum()), 1e-300) / max(float(weights[0].sum()), 1e-300))
 
-    def log_gain(self, label: Label) -> float:
+    def log_gain(self, label: Label, inherent_mm_Al: float = INHERENT.centre) -> float:
         """Logarithm of noise variance over signal but for a constant."""
-        weights = self.weights(label)
+        weights = self.weights(label, inherent_mm_Al)
         return 0.0 if weights is None else math.log(float(weights[1].sum()) / max(float(weights[0].sum()), 1e-300))
 
     def thickness(self, scene: str) -> dict[str, FloatArray]:

@@ -89,7 +89,7 @@ def check_labels(
     known = _Darks(readings=_less(darks, shone_on), twins_DN=dark_DN, good=good, stride=stride)
     dim, judged = flats_without_beam(_measured(lit, known), good)
     _flatten(judged, good)
-    shadowed = shadows_in_flats(judged, good)
+    shadowed = shadows_in_flats(judged, known.noise_DN2, good)
     judged = _less(judged, shadowed)
     means = undeclared_means(judged, known.noise_DN2, good)
     judged = _less(judged, means)

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .findings import Finding, FindingCode
-from .label_model import DEEPEST, INHERENT, LabelModel, measured_depth
+from .label_model import DEEPEST, INHERENT, INHERENT_TRIED_MM_AL, LabelModel, measured_depth
 from .readings import FloatArray, Reading
 
-_INHERENT_TRIED_MM_AL = (*(0.25 * step for step in range(13)), 3.5, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0)  # where flats tell
 _FITS, _FITS_NOT = 0.995, 0.5  # correlations of shadow and map
 _FITS_BETTER = 0.3  # share of what is missing from 1 that another map may leave
 _SCALE_OFF = 0.22  # logarithm of a map's scale that no composition explains
@@ -63,7 +62,7 @@ def _inherent_mm_Al(flats: Sequence[Reading], maps: LabelModel) -> tuple[float, 
     The median over all such flats: one of them may be mislabelled.
     """
     levels = {
-        item.name: np.array([maps.log_level(item.label, mm_Al) for mm_Al in _INHERENT_TRIED_MM_AL])
+        item.name: np.array([maps.log_level(item.label, mm_Al) for mm_Al in INHERENT_TRIED_MM_AL])
         for item in flats
         if item.label.load is not None and item.level_DN > 0 and maps.weights(item.label) is not None
     }
@@ -74,7 +73,7 @@ def _inherent_mm_Al(flats: Sequence[Reading], maps: LabelModel) -> tuple[float, 
             if one.label.kV == other.label.kV and one.label.filters != other.label.filters:
                 measured = math.log(one.level_DN / other.level_DN)
                 off = np.abs(levels[one.name] - levels[other.name] - measured)
-                seen.append(_INHERENT_TRIED_MM_AL[int(np.argmin(off))])
+                seen.append(INHERENT_TRIED_MM_AL[int(np.argmin(off))])
     if seen:
         return (float(np.median(seen)),)
     return (INHERENT.centre, INHERENT.low, INHERENT.centre + 2.0 * INHERENT.sd)

@@ -9,7 +9,8 @@ declared instrument gives for the labels:
     noise/signal free constant + all since the calibration (0.35) + beam (0.08) + beam since (0.08) + series (0.08)
     attenuation  all (0.1) + placement of a scene (0.3) + series (0.12)
 
-wide enough for every effect of the catalogue within its plausible range. A labelling in which series take the kV, filters, exposure
+wide enough for every effect of the catalogue within its plausible range. The tube's inherent filtration is that with which the
+labels fit best, or what is expected of tubes. A labelling in which series take the kV, filters, exposure
 or whole setting of others, or two series change places, must be better by `LEAST_EVIDENCE` (natural logarithm).
 
 Validity: needs several series; a session whose labels are all wrong in the same way is consistent.
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import text_from_filters
 from .findings import Finding, FindingCode
-from .label_model import DEEPEST, LabelModel, measured_depth, open_field
+from .label_model import DEEPEST, INHERENT, INHERENT_TRIED_MM_AL, LabelModel, measured_depth, open_field
 from .readings import FloatArray, Label, Reading
 
 LEAST_EVIDENCE = 10.0
@@ -75,23 +76,30 @@ def relabelled(judged: Sequence[Reading], maps: LabelModel) -> list[Finding]:
     labels = [item.label for item in judged]
     names, kinds = [item.name for item in judged], [item.series.kind for item in judged]
 
-    def evidence(candidate: Sequence[Label]) -> float:
-        return sum(feature.log_evidence(candidate) for feature in features)
+    def evidence(candidate: Sequence[Label], inherent_mm_Al: float) -> float:
+        usual = -0.5 * ((inherent_mm_Al - INHERENT.centre) / INHERENT.sd) ** 2
+        return usual + sum(feature.log_evidence(candidate, inherent_mm_Al) for feature in features)
 
     found: list[Finding] = []
     if not features:
         return found
-    current = evidence(labels)
     for _ in range(_MOST_CHANGES):
+        # of a tube as it is expected, and of the one with which the labels look best
+        mm_Al = max(INHERENT_TRIED_MM_AL, key=lambda one: evidence(labels, one))
+        tubes = {INHERENT.centre, mm_Al}
+        current = evidence(labels, mm_Al)
         strange: dict[int, float] = {}
         for feature in features:
-            for index, z in feature.left_out(labels).items():
+            for index, z in feature.left_out(labels, mm_Al).items():
                 strange[index] = max(strange.get(index, 0.0), z)
         doubtful = sorted((i for i, z in strange.items() if z > _DOUBTFUL_Z), key=lambda i: -strange[i])[
             :_MOST_DOUBTFUL
         ]
         candidates = [*_exchanged_groups(labels, kinds), *_candidates(doubtful, labels, names)]
-        gains = [evidence(candidate.labels) - current - candidate.price for candidate in candidates]
+        gains = [
+            max(evidence(candidate.labels, one) for one in tubes) - current - candidate.price
+            for candidate in candidates
+        ]
         best = max(gains, default=0.0)
         if not best > LEAST_EVIDENCE:
             break
@@ -108,7 +116,6 @@ def relabelled(judged: Sequence[Reading], maps: LabelModel) -> list[Finding]:
         what = f"{chosen.says} {' or '.join(seen)}{labelled}"
         found.append(Finding(code=FindingCode.LABEL, series=first, others=tuple(others), values={"what": what}))
         labels = list(chosen.labels)
-        current = evidence(labels)
     return found
 
 
@@ -119,28 +126,28 @@ class _Feature:
     members: tuple[int, ...]
     values: FloatArray
     own_sd: FloatArray
-    expected: Callable[[int, Label], float]
+    expected: Callable[[int, Label, float], float]  # of a tube with so much inherent filtration, mm Al
     covariance: _Covariance
 
-    def log_evidence(self, labels: Sequence[Label]) -> float:
+    def log_evidence(self, labels: Sequence[Label], inherent_mm_Al: float) -> float:
         from scipy.linalg import cholesky, solve_triangular
 
-        residual, covariance = self._residual(labels)
+        residual, covariance = self._residual(labels, inherent_mm_Al)
         factor = cholesky(covariance, lower=True)
         whitened = np.asarray(solve_triangular(factor, residual, lower=True), dtype=np.float64)
         return float(-0.5 * whitened @ whitened - np.sum(np.log(np.diag(factor))))
 
-    def left_out(self, labels: Sequence[Label]) -> dict[int, float]:
+    def left_out(self, labels: Sequence[Label], inherent_mm_Al: float) -> dict[int, float]:
         """|z| of each member given all others."""
-        residual, covariance = self._residual(labels)
+        residual, covariance = self._residual(labels, inherent_mm_Al)
         inverse = np.linalg.inv(covariance)
         z = np.abs(inverse @ residual) / np.sqrt(np.diag(inverse))
         return dict(zip(self.members, z.tolist(), strict=True))
 
-    def _residual(self, labels: Sequence[Label]) -> tuple[FloatArray, FloatArray]:
+    def _residual(self, labels: Sequence[Label], inherent_mm_Al: float) -> tuple[FloatArray, FloatArray]:
         """Values less what labels let expect (member,), and the covariance of that (member, member)."""
         own = [labels[index] for index in self.members]
-        expected = [self.expected(index, label) for index, label in zip(self.members, own, strict=True)]
+        expected = [self.expected(index, label, inherent_mm_Al) for index, label in zip(self.members, own, strict=True)]
         return self.values - np.array(expected), self.covariance(self.members, own) + np.diag(self.own_sd**2)
 
 
@@ -188,15 +195,15 @@ def _features(judged: Sequence[Reading], maps: LabelModel) -> list[_Feature]:
 
     depths, covered = _attenuations(judged, maps)
 
-    def attenuation(index: int, label: Label) -> float:
-        depth = maps.depth(judged[index].series.scene, label)
+    def attenuation(index: int, label: Label, inherent_mm_Al: float) -> float:
+        depth = maps.depth(judged[index].series.scene, label, inherent_mm_Al=inherent_mm_Al)
         # the deepest parts are where scatter fills in: the median weighs them no more than others
         return 0.0 if depth is None else math.log(max(float(np.median(depth[covered[index]])), 1e-3))
 
     features = []
     for numbers, expected, covariance in (
-        (_levels(judged, maps), lambda _, label: maps.log_level(label), of_levels),
-        (_gains(judged), lambda _, label: maps.log_gain(label), of_gains),
+        (_levels(judged, maps), lambda _, label, mm_Al: maps.log_level(label, mm_Al), of_levels),
+        (_gains(judged), lambda _, label, mm_Al: maps.log_gain(label, mm_Al), of_gains),
         (depths, attenuation, of_attenuations),
     ):
         if len(numbers) > 1:

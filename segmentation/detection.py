@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 MARK_THRESHOLD = 0.5
 DETECTION_RECALL = 0.1
+_BY_CHANCE = 0.05  # level at which networks are said to differ, as in `pod`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,8 +141,9 @@ def rate_of_crossed_trials(
     S^2 the sample variances of the image means, of the network means and of what is left; it is never less than that of
     N M independent trials. It gives the number n* = p (1 - p) / variance of independent trials worth the same (the
     number of images M where p is 0 or 1, or where there is one network), times (t(N M - 1) / t(m))^2 for a variance known
-    with m degrees of freedom (Satterthwaite), t Student's quantile. Clopper-Pearson's interval is taken at n*. With one
-    network the interval is of that network.
+    with m degrees of freedom (Satterthwaite), t Student's quantile. Clopper-Pearson's interval is taken at n*. Networks whose
+    shares differ by no more than chance (F test, 5 %) add no variance: the interval is then of the mean of these networks. With
+    one network it is of that network.
 
     Args:
         successes: (trial,) 0 or 1 (or shares, such as recalls), each network on each image once.
@@ -154,7 +156,7 @@ def rate_of_crossed_trials(
     Source: Clopper and Pearson 1934; Korn and Graubard 1998, Survey Methodology 24:193 (effective sample size); Owen
     2007, Ann. Appl. Stat. 1:386 (crossed effects).
     """
-    from scipy.special import betaincinv, stdtrit
+    from scipy.special import betaincinv, fdtri, stdtrit
 
     values = np.asarray(successes, dtype=np.float64)
     if not values.size:
@@ -173,6 +175,9 @@ def rate_of_crossed_trials(
         from_networks = float(network_mean.var(ddof=1)) / n_networks
         variance = from_images + from_networks - rest_variance / (n_images * n_networks)
         binomial = share * (1.0 - share) / values.size
+        degrees = n_networks - 1, (n_networks - 1) * (n_images - 1)
+        if from_networks * n_networks * n_images <= rest_variance * float(fdtri(*degrees, 1.0 - _BY_CHANCE)):
+            variance, from_networks = from_images, 0.0
         variance = max(variance, from_images, from_networks, binomial)
         parts = from_images**2 / (n_images - 1) + from_networks**2 / (n_networks - 1)
         freedom = max(variance**2 / parts, 1.0) if parts > 0 else np.inf

@@ -1,6 +1,7 @@
 """Networks by name, two channels in; DeepLabV3Plus with an EfficientNet-B0 encoder by default. torch is loaded when first used."""
 
 import math
+import re
 import warnings
 from typing import Any
 
@@ -13,6 +14,11 @@ from .recipe import Recipe
 from .scaling import SCALINGS, crop_to_shape, pad_to_multiple
 
 _UNET_CHANNELS = (64, 32, 16, 16, 16)
+
+
+def _first_sentence(error: Exception) -> str:
+    """What a library said, without its lists of names."""
+    return re.split(r"[.:\[]\s", " ".join(str(error).strip("\"' ").split()) + " ", maxsplit=1)[0].strip()[:90]
 
 
 def build_network(recipe: Recipe, *, seed: int, pretrained: bool = True) -> Any:
@@ -54,7 +60,7 @@ def build_network(recipe: Recipe, *, seed: int, pretrained: bool = True) -> Any:
             if encoder_weights is None:
                 raise InputError(
                     "network",
-                    received=f"{recipe.architecture} with the encoder {recipe.encoder} ({' '.join(str(error).split())[:90]})",
+                    received=f"{recipe.architecture} with the encoder {recipe.encoder} ({_first_sentence(error)})",
                     expected="an architecture and an encoder of segmentation-models-pytorch, such as FPN and resnet18",
                 ) from None
             raise InputError(

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from .runs_io import (
     Runs,
     create_or_resume_runs,
     finished_networks,
+    gone_unless_begun,
     make_configuration,
     network_folder,
     read_result,
@@ -150,9 +151,12 @@ def train_networks(
     validation_examples = examples_from_dataset(dataset, validation, recipe=recipe, fresh=fresh)
     if all(train_examples[number][1][-1].any() for number in range(len(train_examples))):
         say("no training image is without a foreign object: expect false alarms on clean products")
-    runs = create_or_resume_runs(runs_path, configuration)
-    # processes that share a folder on purpose say which networks are theirs; whoever started them holds the lock
-    with nullcontext() if only is not None else only_one(runs.path, "a training"):
+    with ExitStack() as stack:
+        stack.enter_context(gone_unless_begun(runs_path))
+        runs = create_or_resume_runs(runs_path, configuration)
+        # processes that share a folder on purpose say which networks are theirs; whoever started them holds the lock
+        if only is None:
+            stack.enter_context(only_one(runs.path, "a training"))
         done = set(finished_networks(runs))
         results = []
         for number in range(networks) if only is None else only:

@@ -16,7 +16,8 @@ import os
 import pickle
 import warnings
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -165,6 +166,22 @@ def create_or_resume_runs(path: str | os.PathLike[str], configuration: Mapping[s
         )
     _write_json(folder / "run.json", wanted)
     return Runs(path=folder, configuration=wanted)
+
+
+@contextmanager
+def gone_unless_begun(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Take a new RUNS folder away again where the block fails before any network is begun: nobody goes on with what was wrong."""
+    folder = Path(path)
+    older, made = (folder / "run.json").exists(), not folder.exists()
+    try:
+        yield
+    except BaseException:
+        if not older and folder.is_dir() and {item.name for item in folder.iterdir()} <= {"run.json", ".lock"}:
+            for item in folder.iterdir():
+                item.unlink()
+            if made:
+                folder.rmdir()
+        raise
 
 
 def network_folder(runs: Runs, network: int) -> Path:

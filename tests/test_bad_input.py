@@ -13,9 +13,11 @@ import h5py
 import numpy as np
 import pytest
 
+import raytwin as rt
 from raytwin.acquisition import Setting, open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.cli import main
+from raytwin.errors import InputError
 from raytwin.generator.twins.twin_io import write_twin
 
 SHAPE = (24, 28)
@@ -303,6 +305,48 @@ def test_a_failure_leaves_an_existing_output_as_it_was(files, tmp_path, capsys):
     assert out.read_bytes() == b"what was there"
 
 
+def test_no_command_writes_over_what_it_reads(files, tmp_path, capsys):
+    copies = {name: tmp_path / path.name for name, path in files.items()}
+    for name, path in files.items():
+        copies[name].write_bytes(path.read_bytes())
+    twin, session, products = copies["twin"], copies["session"], copies["products"]
+    hits = tmp_path / "hits.csv"
+    hits.write_text("size,hit\n1,0\n2,1\n")
+    same = Path(os.path.relpath(products))  # by another name
+    for words, option in (
+        (["calibrate", session, "-o", session], "-o"),
+        (["generate", twin, products, *GENERATE, "-o", same], "-o"),
+        (["generate", twin, products, *GENERATE, "-o", twin], "-o"),
+        (["pod", hits, "--export", hits], "--export"),
+        (["import", "reference", products, "-o", products], "-o"),
+    ):
+        refused(capsys, tmp_path, words, mentions=f"{option}: got {words[-1]}, which is read")
+    assert all(copies[name].read_bytes() == path.read_bytes() for name, path in files.items())
+    with pytest.raises(InputError, match=r"output: got .*which is read"):
+        rt.generate(twin, products, low=GENERATE[1], high=GENERATE[3], n=1, seed=1, output=products)
+
+
+def test_the_belt_of_a_setting_blurs_images_and_leaves_flats(files):
+    low, high = GENERATE[1], GENERATE[3]
+    still, moving = (
+        rt.generate(
+            files["twin"],
+            files["products"],
+            low=low + belt,
+            high=high + belt,
+            reference_low="kv=40,power_w=40,exposure_ms=100,averaged=10",
+            reference_high="kv=90,power_w=40,exposure_ms=100,averaged=10",
+            n=1,
+            seed=1,
+        )
+        for belt in ("", ",belt_speed_mm_s=100")
+    )
+    assert not np.array_equal(still.images, moving.images)
+    assert any("belt_axis is not declared" in line for line in moving.warnings)
+    with pytest.raises(InputError, match=r"belt_speed_mm_s: got 100.0 and None mm/s; expected one speed"):
+        rt.generate(files["twin"], files["products"], low=low + ",belt_speed_mm_s=100", high=high, n=1, seed=1)
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -411,6 +455,7 @@ def dies(*_, **__):
     os.kill(os.getpid(), signal.SIGSEGV)
 h5py.File = dies
 from raytwin.cli import main
+from raytwin.errors import InputError
 sys.argv = ["raytwin", *sys.argv[1:]]
 sys.exit(main())
 """
@@ -428,6 +473,7 @@ _hdf5._ATTRIBUTE_S = 0.5
 from raytwin.generator.twins import twin_io
 twin_io._READING_S = 2.0
 from raytwin.cli import main
+from raytwin.errors import InputError
 sys.argv = ["raytwin", *sys.argv[1:]]
 sys.exit(main())
 """

@@ -190,7 +190,9 @@ def test_where_nothing_meets_it_the_closest_is_named_with_what_is_missing():
     text = decide(rows, ASKED, judged, recommended=0, unit="mm", changes_by="")["sentence"]
     assert "0 meet it, 1 is open" in text and "comes closest; not yet known: detection" in text
     assert "(5 % too much)" in text
-    assert "None was tried" in decide(rows, ASKED, judged, recommended=None, unit="mm", changes_by="")["sentence"]
+    for trained, said in ((False, "None was tried"), (True, "None of the 1 that were tried has an a90")):
+        rows = [row(trained=trained)]
+        assert said in decide(rows, ASKED, judged, recommended=None, unit="mm", changes_by="")["sentence"]
 
 
 def page_of(answer, folder, *, interactive=False):

@@ -22,10 +22,11 @@ from raytwin.campaign.sweep_choice import Choice, choose, indistinct, paces, par
 from raytwin.campaign.sweep_file import CurveOptions, read_campaign, text_of_pair
 from raytwin.campaign.sweep_report import write_report
 from raytwin.campaign.sweep_runners import DaskCluster, Here, Processes
-from raytwin.campaign.sweep_settings import Outlook, keep_best, labels_of, motion_strength_px, start_pair, twin_at
+from raytwin.campaign.sweep_settings import Outlook, keep_best, labels_of, start_pair
 from raytwin.campaign.sweep_trial import seed_of
 from raytwin.errors import InputError, MissingDependencyError, RaytwinError
 from raytwin.files import only_one
+from raytwin.generator.datasets.belt_motion import motion_strength_px, twin_on_belt
 from raytwin.generator.datasets.generate import generate_dataset
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.predictions.predict import predict_flatfield
@@ -458,15 +459,15 @@ def test_a_moving_belt_smears_images_along_itself_and_keeps_their_mean(line, tmp
     twin = read_twin(line / "twin.h5")
     twin = dataclasses.replace(twin, instrument=dataclasses.replace(twin.instrument, belt_axis="row"))
     still = (
-        setting_from_text(f"kv=40,power_w=40,exposure_ms=50,averaged=10,{BEAM}"),
-        setting_from_text(f"kv=90,power_w=45,exposure_ms=50,averaged=10,{BEAM}"),
+        setting_from_text(f"kv=40,power_w=40,exposure_ms=400,{BEAM}"),
+        setting_from_text(f"kv=90,power_w=20,exposure_ms=400,{BEAM}"),
     )
-    # v M t / pixel is a path of 11 pixels
-    moving = tuple(dataclasses.replace(one, belt_speed_mm_s=11 * 0.45 / 0.05 * 2970 / 3177) for one in still)
-    assert motion_strength_px(twin.instrument, moving[0]) == pytest.approx(11.0)
+    # v M t / pixel is a path of 11 pixels, the strength that in 50 ms
+    moving = tuple(dataclasses.replace(one, belt_speed_mm_s=11 * 0.45 / 0.4 * 2970 / 3177) for one in still)
+    assert motion_strength_px(twin.instrument, moving[0]) == pytest.approx(11.0 / 8)
     profiles, means = [], []
     for number, pair in enumerate((still, moving)):
-        seen, told = twin_at(twin, pair)
+        seen, told = twin_on_belt(twin, pair)
         assert told == ()
         with read_dataset(line / "references.h5") as references:
             generate_dataset(
@@ -475,7 +476,7 @@ def test_a_moving_belt_smears_images_along_itself_and_keeps_their_mean(line, tmp
                 tmp_path / f"{number}.h5",
                 low=pair[0],
                 high=pair[1],
-                images=6,
+                images=12,
                 seed=1,
                 with_counts=False,
             )
@@ -490,6 +491,8 @@ def test_a_moving_belt_smears_images_along_itself_and_keeps_their_mean(line, tmp
     assert np.std(profiles[1][0] - smeared) < 0.5 * np.std(moved)
     assert np.std(profiles[1][1] - profiles[0][1]) < 0.5 * np.std(moved)
     assert means[1] == pytest.approx(means[0], rel=2e-3)
+    with pytest.raises(InputError, match=r"averaged: got 4 frames on a moving belt; expected averaged = 1"):
+        twin_on_belt(twin, tuple(dataclasses.replace(one, averaged=4) for one in moving))
 
 
 def test_a_line_detector_is_as_fast_as_its_belt_and_a_tdi_smears_by_one_stage(line):
@@ -529,7 +532,7 @@ def test_a_twin_with_effects_is_taken_and_decides_the_result(line):
     assert one.feasible
     # motion that was found at another speed is not there twice
     assert any("gives way" in text for text in one.warnings)
-    seen, _ = twin_at(read_twin(line / "improved.h5"), one.pair)
+    seen, _ = twin_on_belt(read_twin(line / "improved.h5"), one.pair)
     assert [item.id for item in seen.effects] == ["object_scatter", "motion_blur"]
 
 

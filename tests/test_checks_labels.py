@@ -228,7 +228,7 @@ def test_effects_at_the_end_of_their_range_are_not_taken_for_wrong_labels(tmp_pa
             "its tube voltage (",
         ),
         (exchange_everywhere("object"), None, "exchanged in all objects"),
-        (label(f"{FLAT_40}_2", filter=""), {f"{FLAT_40}_2"}, "looks like Cu:0.05 (labelled no filter)"),
+        (label(f"{FLAT_40}_2", filter="Cu:0.2"), {f"{FLAT_40}_2"}, "looks like Cu:0.05 or 100 ms (labelled Cu:0.2)"),
         (label(f"{FLAT_40}_2", exposure_ms=100.0), {f"{FLAT_40}_2"}, "looks like 25 ms (labelled 100 ms)"),
         (
             label("dark_25ms_2", kind="flat", kV=40.0, power_W=82.0, filter="Cu:0.05"),

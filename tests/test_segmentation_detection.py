@@ -127,6 +127,13 @@ def test_few_networks_that_differ_widen_the_interval_by_students_quantile():
     assert found.low < 0.5 - 1.9 * mean_error
 
 
+def test_two_networks_that_agree_are_not_worth_less_than_their_images():
+    """One alarm of two networks at 13 images: as often as by chance, and no sign that networks differ."""
+    alarms = np.arange(26) == 17
+    found = rate_of_crossed_trials(alarms, networks=np.repeat([0, 1], 13), images=np.tile(np.arange(13), 2))
+    assert 0.1 < found.high < 0.25 and found.low > 1e-4
+
+
 def test_independent_trials_are_worth_all_of_them():
     values = np.random.default_rng(1).random(50 * 40) < 0.3
     rate = rate_of_crossed_trials(values, networks=np.repeat(np.arange(50), 40), images=np.tile(np.arange(40), 50))

@@ -280,6 +280,18 @@ def test_encoder_weights_that_cannot_be_fetched_are_one_clear_line(monkeypatch):
         build_network(recipe, seed=0)
 
 
+def test_a_training_that_is_refused_leaves_nothing_that_refuses_the_next(dataset_file, tmp_path):
+    folder = tmp_path / "networks"
+    with read_dataset(dataset_file) as dataset:
+        with pytest.raises(InputError, match="network: got Unett"):
+            train_networks(dataset, folder, recipe=dataclasses.replace(QUICK, architecture="Unett"))
+        assert not folder.exists()
+        folder.mkdir()
+        with pytest.raises(InputError, match="network: got Unett"):
+            train_networks(dataset, folder, recipe=dataclasses.replace(QUICK, architecture="Unett"))
+        assert folder.exists() and not any(folder.iterdir())
+
+
 def test_without_torch_the_message_holds_the_command_that_installs_it(monkeypatch):
     import sys
 

@@ -18,10 +18,10 @@ import numpy as np
 
 from raytwin.acquisition.dataset_io import read_dataset
 from raytwin.acquisition.setting import setting_from_text
-from raytwin.campaign.sweep_settings import twin_at
 from raytwin.campaign.trial import curve_of_table, detect_on_file, thresholds_from_images, write_split
 from raytwin.cli import main as raytwin
 from raytwin.files import whole_file
+from raytwin.generator.datasets.belt_motion import twin_on_belt
 from raytwin.generator.datasets.generate import generate_dataset
 from raytwin.generator.twins.twin_io import read_twin
 from raytwin.observers import DETECTORS, LineImages, MeasuredSize, Observer, fit_efficiency, objects_of_references
@@ -124,7 +124,7 @@ def tried(twin, references, trained, folder, pair, number):
     folder.mkdir(parents=True, exist_ok=True)
     hits = folder / "hits.csv"
     if not hits.exists():
-        at, _ = twin_at(twin, pair)
+        at, _ = twin_on_belt(twin, pair)
         for part, source in (("train", "learn"), ("test", "test")):
             with read_dataset(references / f"{source}.h5") as reference:
                 known = {row.image for row in reference.rows}

@@ -6,5 +6,6 @@ Files:
     known_scenes         images of objects whose path lengths are known
     render               transmission and quantum variance of a scene
     image_effects        effects in single images
+    belt_motion          the motion that a belt makes in images
     fresh                images with new noise at every look
 """

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...acquisition.instrument import Instrument
 from ...acquisition.setting import Filter, Setting, text_from_filters
 from ...errors import InputError
-from ...materials import material_from_name, mu_per_mm
+from ...materials import TABLES, material_from_name, mu_per_mm
 from ...results import Result, Table, interval_text, plain
 from ...spectra import BIN_WIDTH_KEV, Response, Spectrum, checked_kV, half_value_layer_mm, mean_energy_keV
 from ..line.line_limits import check_limits
@@ -243,7 +243,7 @@ def predict_effective_mu(
     """Effective attenuation of a material in a calibrated tube's beam, 1/mm, with its 95 % interval.
 
     -ln(sum(w exp(-mu L)) / sum(w)) / L, at L = 0 the thin limit sum(w mu) / sum(w); w photons times what the detector makes
-    of them. xraylib's attenuation; how far tables differ is not in the interval.
+    of them. xraylib's attenuation; how far tables differ for the material is in the interval.
 
     Args:
         twin: with a spectral part.
@@ -267,10 +267,14 @@ def predict_effective_mu(
         model = model_of_posterior(posterior, highest_kV=kV)
         weights = photons * model.deposit_tables(posterior.samples)[0, :, : energies.size]
     weights = weights / weights.sum(axis=1, keepdims=True)
-    mu = mu_per_mm(material_from_name(material), energies)
-    if thickness_mm > 0:
-        return _interval(-np.log(weights @ np.exp(-mu * thickness_mm)) / thickness_mm)
-    return _interval(weights @ mu)
+
+    def effective(of: FloatArray, table: str = "xraylib") -> FloatArray:
+        mu = mu_per_mm(material_from_name(material), energies, table=table)
+        return of @ mu if thickness_mm == 0 else -np.log(of @ np.exp(-mu * thickness_mm)) / thickness_mm
+
+    by_table = [float(effective(weights.mean(axis=0), table)) for table in TABLES]
+    spread_of_tables = float(np.std(by_table, ddof=1) / np.mean(by_table))
+    return _interval(effective(weights)).widened(spread_of_tables)
 
 
 def _posterior(twin: Twin | TubeTwin) -> SpectralPosterior:

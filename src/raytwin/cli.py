@@ -12,6 +12,7 @@ from difflib import get_close_matches
 from . import __version__
 from ._log import kept_in, taken_out
 from .errors import InputError, RaytwinError
+from .files import check_not_read
 
 # name -> (module in raytwin.commands, one line for `raytwin --help`)
 COMMANDS: dict[str, tuple[str, str]] = {
@@ -83,6 +84,10 @@ READING = frozenset(
         "report",
     }
 )
+
+
+# arguments of commands that name files to write
+WRITTEN = frozenset({"output", "out", "export", "plot", "report", "save"})
 
 
 # what the system may refuse, and what to do about it
@@ -161,6 +166,18 @@ def _as_options(argument: str, options: Mapping[str, str]) -> str:
     return argument
 
 
+def _check_written(given: Mapping[str, object]) -> None:
+    """Refuse a file to write that another argument reads.
+
+    Raises:
+        InputError: such a file.
+    """
+    rest = [value for name, value in given.items() if name not in WRITTEN]
+    read = [one for value in rest for one in (value if isinstance(value, list | tuple) else [value])]
+    for name in WRITTEN & given.keys():
+        check_not_read(given[name], read=read, argument=name)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code: 0 success, 1 internal failure, 2 bad input."""
     try:
@@ -203,6 +220,7 @@ def _main(words: list[str]) -> int:
                 remedy=_near(unknown[0], taken),
             )
         options = parsed.option_of_argument
+        _check_written(vars(parsed))
         code: int = parsed.run(parsed)
         sys.stdout.flush()
         return code

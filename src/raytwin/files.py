@@ -5,7 +5,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -118,6 +118,27 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         )
 
 
+def check_not_read(path: object, *, read: Iterable[object], argument: str = "output") -> None:
+    """Refuse to write a file that is read as well: what it held would be lost.
+
+    Args:
+        path: of a file to write; anything else is let pass.
+        read: what is read; paths count, and objects with a `path`, everything else does not.
+        argument: what the file to write is to the user, for the message.
+
+    Raises:
+        InputError: `path` is one of `read`.
+    """
+    if not isinstance(path, str | os.PathLike) or not Path(path).is_file():
+        return
+    for given in read:
+        one = getattr(given, "path", given)
+        if isinstance(one, str | os.PathLike) and Path(one).is_file() and Path(one).samefile(path):
+            raise InputError(
+                argument, received=f"{path}, which is read", expected="another one: what it holds would be lost"
+            )
+
+
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary name beside `path` that becomes `path` when the block succeeds and disappears when it fails.
@@ -155,6 +176,19 @@ def sha256_of_file(path: str | os.PathLike[str]) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def check_new_folder(path: str | os.PathLike[str]) -> None:
+    """Refuse a folder to write that holds something, before the work that fills it.
+
+    Raises:
+        InputError: a file, or a folder with something in it.
+    """
+    final = given_path(path, expected="a folder to write")
+    if final.exists() and (not final.is_dir() or any(final.iterdir())):
+        raise InputError(
+            str(path), received="a file or a folder with something in it", expected="a new or empty folder"
+        )
+
+
 @contextmanager
 def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary folder beside `path` that becomes `path` when the block succeeds and disappears when it fails.
@@ -162,11 +196,8 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises:
         InputError: `path` is a file or a folder with something in it, or lies where nothing can be written.
     """
-    final = given_path(path, expected="a folder to write")
-    if final.exists() and (not final.is_dir() or any(final.iterdir())):
-        raise InputError(
-            str(path), received="a file or a folder with something in it", expected="a new or empty folder"
-        )
+    check_new_folder(path)
+    final = Path(path)
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{final.name}.", dir=final.parent))

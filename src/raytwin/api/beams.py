@@ -479,7 +479,7 @@ def spectrum(
     from ..spectra import air_kerma_uGy_per_mAs, fluence_per_cm2_mAs, half_value_layer_mm, mean_energy_keV
 
     if twin is not None:
-        _alone(anode, anode_angle_deg, model, spectrum_file)
+        _alone(anode, anode_angle_deg, model, spectrum_file, table=table)
         return _spectrum_of_twin(twin, kV=kV, layers=as_layers(filter, library_from_files(library)))
     beam = _beam(
         kV=kV,
@@ -506,8 +506,12 @@ def spectrum(
     )
 
 
-def _alone(*stated: Any) -> None:
-    """Refuse a tube that is stated beside a calibrated one."""
+def _alone(*stated: Any, table: str) -> None:
+    """Refuse a tube, or attenuation data, that are stated beside a calibrated one."""
+    if table != "xraylib":
+        raise InputError(
+            "table", received=f"{table!r} with a twin", expected="none: the twin's intervals hold all tables"
+        )
     if any(item is not None for item in stated):
         raise InputError("twin", received="also a stated tube", expected="a twin or a stated tube, not both")
 
@@ -647,7 +651,7 @@ def mu(
     known = library_from_files(library)
     found = material_from_name(material, library=known)
     if twin is not None:
-        _alone(anode, anode_angle_deg, model, spectrum_file, energy_keV)
+        _alone(anode, anode_angle_deg, model, spectrum_file, energy_keV, table=table)
         return _mu_of_twin(
             twin,
             found,

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ..errors import FileFormatError, InputError, check_number
+from ..files import check_new_folder, check_not_read
 from ..results import Result, Table, axes_or_new, counted, frame, plain
 from ._given import PathLike, as_twin, dataset_of, twin_sha256, whole_seed
 from ._progress import Progress, Telling
@@ -348,11 +349,16 @@ def generate(
     """
     from ..acquisition.dataset_io import read_dataset as open_dataset
     from ..acquisition.tiff_folder import write_tiff_folder
+    from ..generator.datasets.belt_motion import twin_on_belt
     from ..generator.predictions.predict_settings import as_setting
     from ..materials import material_from_name
 
     check_number("n", n)
-    known, targets = as_twin(twin), (as_setting(low), as_setting(high))
+    check_not_read(output, read=(twin, reference))
+    if tiff is not None:
+        check_new_folder(tiff)
+    targets = as_setting(low), as_setting(high)
+    known, told = twin_on_belt(as_twin(twin), targets)
     material_from_name(product_material)
     material_from_name(foreign_material)
     if (reference_low is None) != (reference_high is None):
@@ -410,7 +416,7 @@ def generate(
                     **common,
                 )
         with open_dataset(path) as dataset:
-            warnings, written = summary.warnings, None
+            warnings, written = (*told, *summary.warnings), None
             if tiff is not None:
                 folder = write_tiff_folder(dataset, tiff)
                 written = {"folder": folder.folder, "trees": list(folder.trees)}
@@ -691,11 +697,14 @@ def _fresh(
     warnings: list[str],
 ) -> "tuple[Callable[[int, int], NDArray[np.float32]], dict[str, Any]]":
     """What makes the images of an epoch, and what decides them."""
+    from ..generator.datasets.belt_motion import twin_on_belt
     from ..generator.datasets.fresh import FreshReferences
     from ..generator.predictions.predict_settings import as_setting
 
     pair = (as_setting(low), as_setting(high))
-    source = FreshReferences(as_twin(twin), references.path, low=pair[0], high=pair[1], seed=seed)
+    moving, told = twin_on_belt(as_twin(twin), pair)
+    warnings += told
+    source = FreshReferences(moving, references.path, low=pair[0], high=pair[1], seed=seed)
     warnings += source.warnings
 
     def images(number: int, epoch: int) -> "NDArray[np.float32]":
@@ -773,6 +782,7 @@ def detect(
 
     if split is not None and split not in SPLITS:
         raise InputError("split", received=repr(split), expected="one of " + ", ".join(SPLITS))
+    check_not_read(output, read=(runs, dataset))
     warnings: list[str] = []
     meant: dict[str, Any] = {"scaling": scaling, "probabilities": probabilities, "classes": classes}
     if network is not None and not isinstance(runs, TrainedNetworks | str | os.PathLike):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, check_number
-from ..files import given_path
+from ..files import check_not_read, given_path
 from ..results import Result, Table, counted, frame, plain
 from ._given import PathLike, as_twin, generator_of
 from ._progress import Progress, Telling
@@ -132,6 +132,7 @@ def import_data(
         raise InputError("layout", received=repr(layout), expected="one of " + ", ".join(LAYOUTS))
     given_path(source, expected="a folder or file to import", argument="source")
     given_path(output, expected="a file to write", argument="output")
+    check_not_read(output, read=(source, twin))
     work = getattr(import_module(f"..acquisition.{layout}", __package__), f"import_{layout}")
     given = _words(layout, words)
     if layout == "reference":

@@ -1,4 +1,7 @@
-"""Predict the flatfield of a twin at a setting, measured or not, with 95 % intervals."""
+"""Predict the flatfield of a twin at a setting, measured or not, with 95 % intervals.
+
+Air kerma is that at the object, of one exposure; where the distance of the object is not known, at the detector.
+"""
 
 import argparse
 from typing import Any

@@ -197,6 +197,6 @@ def _result_lines(rows: Sequence[Mapping[str, Any]], other_size: str) -> list[st
 
 
 def _measurement_lines(decision: Mapping[str, Any] | None) -> list[str]:
-    if decision is None:
+    if decision is None or not decision["measurements"]:
         return []
     return ["To be surer, measure on the real line:", *(f"  {one['text']}" for one in decision["measurements"])]

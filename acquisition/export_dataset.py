@@ -75,6 +75,8 @@ def export_dataset(
         )
     if labels not in LABELS:
         raise InputError("labels", received=repr(labels), expected="one of " + ", ".join(LABELS))
+    if labels != LABELS[0] and to != "yolo":
+        raise InputError("labels", received=f"{labels} with {to}", expected="none: the option is of yolo")
     if bits is not None and bits not in _GREY_BITS:
         raise InputError("bits", received=bits, expected="8 or 16")
     if pixel_mm is None:

@@ -59,7 +59,8 @@ def find_interpolated(series: Sequence[Series]) -> NDArray[np.bool_] | None:
     result = np.zeros(shape, dtype=bool)
     inside = np.s_[1:-1, 1:-1]
     for squares in left[:, *inside]:
-        share = squares / np.maximum(own[inside], np.finfo(np.float32).tiny)
+        with np.errstate(over="ignore"):  # a pixel that never changes leaves all of it
+            share = squares / np.maximum(own[inside], np.finfo(np.float32).tiny)
         result[inside] |= (squares < least * _nearby(squares)) & (share < least * _nearby(share))
     return result
 

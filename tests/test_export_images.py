@@ -127,6 +127,12 @@ def test_coco_annotations_and_pictures_give_masks_and_values_back(dataset, tmp_p
     assert seen == set(range(6))
 
 
+def test_labels_are_of_yolo_alone(dataset, tmp_path):
+    with pytest.raises(rt.InputError, match="labels: got boxes with coco; expected none"):
+        rt.export(dataset, tmp_path / "coco", to="coco", labels="boxes")
+    assert not (tmp_path / "coco").exists()
+
+
 @pytest.mark.parametrize("labels", ["polygons", "boxes"])
 def test_yolo_labels_are_shares_of_the_image(dataset, tmp_path, labels):
     written = rt.export(dataset, tmp_path / "yolo", to="yolo", labels=labels)

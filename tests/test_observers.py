@@ -350,6 +350,10 @@ def test_a_setting_that_the_line_cannot_have_gets_no_number(line, make_model_twi
     assert found.rows[1]["a50"] is None and found.rows[1]["a90"] is None and found.rows[1]["a90_delta_R"] is None
     assert all(math.isnan(one) for one in found.pod[1])
     assert sum("saturates" in text for text in found.warnings) == 1
+    assert not any("outside the calibrated range" in text for text in found.warnings)
+    beyond = rt.observe(line.twin, pair_at(5, kV=(40, 120)), **words)
+    (told,) = (text for text in beyond.warnings if "outside the calibrated range" in text)
+    assert told.startswith("kv=120") and "kV (" in told
     weak = dataclasses.replace(line.twin, instrument=dataclasses.replace(line.twin.instrument, maximum_kV=80.0))
     refused = rt.observe(weak, pair_at(20), **words)
     assert refused.rows[0]["a90"] is None and any("kV" in text for text in refused.warnings)

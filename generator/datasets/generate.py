@@ -191,7 +191,7 @@ class ChannelModel:
             brightest = self.open_signal_DN + 4.0 * noise_DN + self.dark_DN
             cut = 100.0 * float(np.mean(brightest > 2.0**bits - 1))
             if cut > 1.0:
-                found.append(f"{self.target} drives {cut:.2g} % of the pixels in the open field to the end of the ADC")
+                found.append(f"{self.target} drives {cut:.3g} % of the pixels in the open field to the end of the ADC")
         return tuple(found)
 
     @property

@@ -46,6 +46,16 @@ def check_number(argument: str, value: object, *, unit: str = "") -> None:
         raise InputError(argument, received=repr(value), expected=f"a number, in {unit}" if unit else "a number")
 
 
+def check_whole(argument: str, value: object, *, least: int) -> None:
+    """Refuse what is no whole number, or below the least.
+
+    Raises:
+        InputError: another number, a truth value, a text or another object.
+    """
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < least:
+        raise InputError(argument, received=repr(value), expected=f"a whole number, {least} or more")
+
+
 class FileFormatError(InputError):
     """A file is truncated, of another format, or lacks what its format requires."""
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from ..errors import FileFormatError, InputError, check_number
+from ..errors import FileFormatError, InputError, check_whole
 from ..files import check_new_folder, check_not_read
 from ..results import Result, Table, axes_or_new, counted, frame, plain
 from ._given import PathLike, as_twin, dataset_of, twin_sha256, whole_seed
@@ -353,7 +353,7 @@ def generate(
     from ..generator.predictions.predict_settings import as_setting
     from ..materials import material_from_name
 
-    check_number("n", n)
+    check_whole("n", n, least=1)
     check_not_read(output, read=(twin, reference))
     if tiff is not None:
         check_new_folder(tiff)
@@ -611,6 +611,8 @@ def train(
             received="only a part of fresh_noise, low and high",
             expected="all three: a twin and the two settings to train for",
         )
+    for word, value in (("networks", networks), ("workers", workers)):
+        check_whole(word, value, least=1)
     if workers != 1 and fresh_noise is not None:
         raise InputError(
             "workers", received=f"{workers} with fresh_noise", expected="1: fresh noise is drawn in one process"

@@ -241,7 +241,7 @@ def observe(
     found = observe_settings(line, pairs, objects, observer=observer, texture=texture)
     expected = None if efficiency is None else predicted_sizes(line, pairs, objects, efficiency, texture=texture)
     against = line.reasons_against(pairs)
-    warnings = [*line.warnings, *(reason for reason in against if reason)]
+    warnings = [*line.warnings, *(reason for reason in against if reason), *_outside(line, pairs)]
     largest = float(objects.size.max())
     if efficiency is None:
         warnings.append(
@@ -383,6 +383,22 @@ def objects_of_file(
             size=size,
             with_texture=with_texture,
         )
+
+
+def _outside(line: "LineImages", pairs: "Sequence[tuple[Setting, Setting]]") -> list[str]:
+    """Settings beyond what calibrated the twin, in words."""
+    from ..generator.predictions.predict import spectrum_outside
+
+    if line.twin.spectral is None:
+        return []
+    found = []
+    for setting in dict.fromkeys(one for pair in pairs for one in pair):
+        outside = spectrum_outside(line.twin.spectral, kV=setting.kV, filters=setting.filters)
+        if outside:
+            found.append(
+                f"{setting}: outside the calibrated range of {', '.join(outside)}; a90 rests on the spectral model"
+            )
+    return found
 
 
 def _pairs(settings: Any) -> list[tuple[Setting, Setting]]:

@@ -79,7 +79,8 @@ def calibrate(
             calibrate the tube alone.
         output_table: what a dosimeter read (CSV, docs/dosimeter.md).
         transmission: what an absorber let through (CSV, docs/dosimeter.md).
-        instrument: anode, angle and declared layers of a tube alone; None: W, 12 degrees, none.
+        instrument: anode, angle and declared layers of a tube alone, a `raytwin.acquisition.instrument.Instrument`; None: W, 12
+            degrees, none.
         spectra: measured spectra of the tube in place of the model's: kV -> file of two columns (keV, fluence per keV).
         estimator: variances from `pairs` of successive frames, or from the `stack` about its mean.
         layer: `front` or `back` of a dual-layer panel; None: front.

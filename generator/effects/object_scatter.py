@@ -16,7 +16,7 @@ p is water's share of scattered photons into a direction, per sr, of the beam be
 free atoms, with h = g for what stands nowhere else than in the air gap. One law for the gap: h grows as a power
 (`gap_exponent`, 1: in proportion) of g, and what all directions get stays, so that what a field of finite size catches
 falls by itself. `beyond` is how much of what stands at the borders of the picture goes on beyond them and scatters there: 0, the
-beam is collimated to the detector; 1, it is far wider. Photons that scatter more than once are not counted
+beam is collimated to the detector; 1, it is far wider; the diagnosis tries both. Photons that scatter more than once are not counted
 apart: behind 20 mm of water the virtual lab has 3-7 % of them (40 and 90 kV, 100 and 350 mm of air), spread more evenly.
 """
 
@@ -43,8 +43,8 @@ _WATER_MM = 20.0
 _BORDER_DEPTH = 1.0  # range of optical depth across 3 x 3 pixels from which a pixel cannot be told by its mean
 _ENERGIES = 6  # that stand for a beam where directions depend on them
 _COARSE = 48  # cells a side: the kernel is broad, so the convolution is done on block means
-_COARSE_BEYOND = 24  # of what comes from beyond the borders, which is smoother
-_STRIPS = 10  # beyond a border, each twice as wide as the last one, and the last one without an end
+_COARSE_BEYOND = 12  # of what comes from beyond the borders, which is smoother
+_STRIPS = 7  # beyond a border, each twice as wide as the last one, and the last one without an end
 _ENDLESS_MM = 1e7
 
 
@@ -345,6 +345,7 @@ OBJECT_SCATTER = Effect(
             default=0.0,
             source="0: beam collimated to the detector; 1: what stands at the borders goes on beyond them, irradiated",
             log=False,
+            fitted=False,
         ),
         Parameter(
             name="reference_keV",

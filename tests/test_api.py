@@ -346,7 +346,7 @@ def test_seeds_may_be_generators_and_progress_a_function(inside, capsys):
     assert "2/2" in capsys.readouterr().err
     with pytest.raises(rt.InputError, match="seed"):
         rt.calibrate("session.h5", seed="now")
-    with pytest.raises(rt.InputError, match=r"n: got 2\.5; expected a whole number, 1 or more"):
+    with pytest.raises(rt.InputError, match=r"number of images: got 2\.5; expected a whole number, 1 or more"):
         rt.generate("twin.h5", "references.h5", seed=1, **(pair | {"n": 2.5}))
 
 

@@ -225,10 +225,12 @@ def test_nothing_on_disk_tells_a_label_before_all_answers_are_in(tmp_path):
                 if file.is_file() and file != path:
                     text = file.read_bytes() + str(file.relative_to(place)).encode()
                     answered = file.parent.name == "answers"
+                    # a hash may hold the digits of the seed by chance
+                    plain = re.sub(rb"[0-9a-f]{64}", b"", text)
                     told.extend(
                         f"{file}: {word}"
                         for word in (*LAB, "single", str(FRESH), "session_seed")
-                        if not answered and word.encode() in text
+                        if not answered and word.encode() in plain
                     )
         assert sorted(item.name for item in path.parent.iterdir()) == ["session.h5"]
         return fake_judge(path, without, features_only)

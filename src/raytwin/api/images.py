@@ -353,7 +353,7 @@ def generate(
     from ..generator.predictions.predict_settings import as_setting
     from ..materials import material_from_name
 
-    check_whole("n", n, least=1)
+    check_whole("number of images", n, least=1)
     check_not_read(output, read=(twin, reference))
     if tiff is not None:
         check_new_folder(tiff)

@@ -604,14 +604,10 @@ def text_of_pair(pair: Pair) -> str:
 
 
 def _check_pair(pair: Pair) -> None:
+    from ..generator.datasets.belt_motion import check_one_belt
     from ..materials import material_from_name
 
-    if pair[0].belt_speed_mm_s != pair[1].belt_speed_mm_s:
-        raise InputError(
-            "belt_speed_mm_s",
-            received=f"{pair[0].belt_speed_mm_s} and {pair[1].belt_speed_mm_s} mm/s",
-            expected="one speed for both images: there is one belt",
-        )
+    check_one_belt(pair)
     for setting in pair:
         setting.stated_load_mAs()
         for layer in setting.filters:

@@ -283,8 +283,6 @@ def _check(
     if known["extrapolated"] and not limits.extrapolation:
         raise _Refused("outside the calibrated range, and extrapolation = false")
     speed, motion = known["belt_speed_mm_s"], known["motion_px"]
-    if speed is not None and max(one.averaged for one in pair) > 1:
-        raise _Refused("frames averaged on a moving belt show the object in several places: averaged = 1")
     pitch, pair_ms = timing.product_pitch_mm, known["pair_ms"]
     if speed is not None and pitch is not None and pair_ms is not None and pair_ms > 1000.0 * pitch / speed:
         raise _Refused(

@@ -123,7 +123,7 @@ def shadows_in_flats(judged: Sequence[Reading], read_DN2: float, good: NDArray[n
             continue  # darks and read noise have a pattern of their own
         picture = np.maximum(np.asarray(item.picture), 1e-3)[good]
         low, high = np.quantile(np.log(picture), [0.05, 0.95])
-        # of the mean frame and of the dark that was subtracted; nine pixels in ten lie within 3.3 standard deviations
+        # of the mean frame and of the dark that was subtracted; 3.3 standard deviations lie between these quantiles of noise
         single_DN2 = max(item.gain_DN, 0.0) * item.level_DN + read_DN2
         mean_DN2 = single_DN2 / min(item.series.n_frames, FRAMES_READ) + read_DN2 / FRAMES_READ
         noise = 3.3 * math.sqrt(mean_DN2) / max(item.level_DN, 1e-9)

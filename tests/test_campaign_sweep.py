@@ -403,7 +403,7 @@ def limit(words):
         ([("low_kv = 40", "low_kv = 40\nsource_detector_mm = 1000")], "another magnification"),
         ([("low_kv = 40", "low_kv = 40\nbinning = 2")], "bin"),
         ([("Cu:0.05", "Al:1"), limit("extrapolation = false")], "extrapolation = false"),
-        ([("low_kv = 40", "low_kv = 40\nbelt_speed_mm_s = 10\naveraged = 2")], "averaged on a moving belt"),
+        ([("low_kv = 40", "low_kv = 40\nbelt_speed_mm_s = 10\naveraged = 2")], "2 frames on a moving belt"),
         ([("low_kv = 40", "low_kv = 40\nframe_interval_ms = 5")], "at least 22 ms"),
         ([FAST, limit("maximum_belt_speed_mm_s = 500")], "belt speed 900 mm/s"),
         ([FAST, limit("maximum_motion_px = 5")], "motion in one exposure"),

@@ -22,6 +22,20 @@ def motion_strength_px(instrument: Instrument, setting: Setting) -> float | None
     return path / (instrument.tdi_stages or 1) if instrument.detector == "tdi" else path
 
 
+def check_one_belt(pair: tuple[Setting, Setting]) -> None:
+    """Refuse a pair of settings whose belts run at two speeds.
+
+    Raises:
+        InputError: two speeds.
+    """
+    if pair[0].belt_speed_mm_s != pair[1].belt_speed_mm_s:
+        raise InputError(
+            "belt_speed_mm_s",
+            received=f"{pair[0].belt_speed_mm_s} and {pair[1].belt_speed_mm_s} mm/s",
+            expected="one speed for both images: there is one belt",
+        )
+
+
 def twin_on_belt(twin: Twin, pair: tuple[Setting, Setting]) -> tuple[Twin, tuple[str, ...]]:
     """The twin with the motion that the pair's belt speed makes in its images, and warnings.
 
@@ -30,12 +44,7 @@ def twin_on_belt(twin: Twin, pair: tuple[Setting, Setting]) -> tuple[Twin, tuple
     Raises:
         InputError: two speeds, or frames averaged while the belt moves.
     """
-    if pair[0].belt_speed_mm_s != pair[1].belt_speed_mm_s:
-        raise InputError(
-            "belt_speed_mm_s",
-            received=f"{pair[0].belt_speed_mm_s} and {pair[1].belt_speed_mm_s} mm/s",
-            expected="one speed for both images: there is one belt",
-        )
+    check_one_belt(pair)
     if pair[0].belt_speed_mm_s is not None and max(one.averaged for one in pair) > 1:
         raise InputError(
             "averaged",

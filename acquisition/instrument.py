@@ -51,6 +51,7 @@ class Instrument:
     readout_overlaps: bool | None = None
     tdi_stages: int | None = None
     maximum_counts_per_s: float | None = None
+    threshold_keV: float | None = None
     interlayer: tuple[Filter, ...] | None = None
     back_scintillator: tuple[Filter, ...] | None = None
     binning_adds: str | None = None
@@ -60,7 +61,7 @@ class Instrument:
         if self.scintillator == ():
             # a detector without a sensitive layer is none: what it is, is not stated
             object.__setattr__(self, "scintillator", None)
-        zero_allowed = {"focal_spot_mm", "readout_ms"}
+        zero_allowed = {"focal_spot_mm", "readout_ms", "threshold_keV"}
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, bool) or not isinstance(value, int | float):
@@ -91,6 +92,12 @@ class Instrument:
                 "instrument maximum_counts_per_s",
                 received=f"{self.maximum_counts_per_s:g} counts/s for an integrating detector",
                 expected="no count limit, or counting = true",
+            )
+        if self.threshold_keV is not None and self.counting is False:
+            raise InputError(
+                "instrument threshold_keV",
+                received=f"{self.threshold_keV:g} keV for an integrating detector",
+                expected="no threshold, or counting = true",
             )
         if self.interlayer is not None and self.back_scintillator is None:
             raise InputError(

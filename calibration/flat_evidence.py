@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.setting import text_from_filters
+from ..generator.line.twin import Z95
 from .dark_frames import DarkFrames
 from .flat_levels import SeriesPoint, load_mAs_of, scatter_of_flats
 from .noise_of_flats import FlatNoise
@@ -152,7 +153,7 @@ def _uneven(ratios: Sequence[tuple[str, float, float]], *, degrees: int) -> list
 
 def _finite_pair(route: tuple[float, float]) -> dict[str, float] | None:
     value, sd = route
-    return {"value": value, "low": value - 1.959964 * sd, "high": value + 1.959964 * sd} if math.isfinite(sd) else None
+    return {"value": value, "low": value - Z95 * sd, "high": value + Z95 * sd} if math.isfinite(sd) else None
 
 
 def session_evidence(

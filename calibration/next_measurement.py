@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..acquisition.setting import Filter, Setting, filters_from_text, text_from_filters
 from ..generator.line.measured_flats import measured_flats
 from ..generator.line.spectral_signal import OpenBeam
-from ..generator.line.twin import Estimate, Twin
+from ..generator.line.twin import Z95, Estimate, Twin
 from ..generator.predictions.predict import spectral_model_of
 from ..materials import material_from_name, transmission
 from ..spectra import MAXIMUM_KV_OF_ANODE, MINIMUM_KV
@@ -183,7 +183,7 @@ def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
         behind = np.array([logs(kV, (*filters, step))[0] - open_rate for step in steps])
         candidates.append(("wedge", setting, steps, behind, np.full(len(steps), _WEDGE_SD**2 + level_sd**2)))
     ranked = []
-    half_width = 1.96 * np.sqrt(before + floor)
+    half_width = Z95 * np.sqrt(before + floor)
     width = 100.0 * float(np.mean(half_width[::3]))
     elsewhere = np.array([kV not in voltages for kV, _ in grid], dtype=bool)
     of_levels = 100.0 * half_width[::3]
@@ -195,7 +195,7 @@ def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
         cross = wanted @ centred.T / draws
         own = centred @ centred.T / draws + np.diag(noise + _RIDGE)
         gained = np.sum(cross * np.linalg.solve(own, cross.T).T, axis=1)
-        after = 1.96 * np.sqrt(np.maximum(before - gained, 0.0) + floor)
+        after = Z95 * np.sqrt(np.maximum(before - gained, 0.0) + floor)
         shrinks_to, dose_shrinks_to = (
             float(np.mean(after[chosen]) / np.mean(half_width[chosen])) for chosen in (~of_kerma, of_kerma)
         )
@@ -240,7 +240,7 @@ def _passes(filters: tuple[Filter, ...], kV: float) -> bool:
 
 def _median_relative_sd(estimates: Sequence[Estimate | None]) -> float:
     known = [item for item in estimates if item is not None and item.value > 0]
-    return float(np.median([(item.high - item.low) / (2 * 1.959964) / item.value for item in known]))
+    return float(np.median([item.sd / item.value for item in known]))
 
 
 def _exposed(twin: Twin, kV: float, filters: tuple[Filter, ...], rate_DN_per_mAs: float) -> Setting | None:

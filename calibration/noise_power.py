@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..generator.line.twin import Z95
 from .frame_checks import repeats_the_last
 from .frame_sums import effective_frames
 
@@ -696,7 +697,7 @@ def correlation_of_quanta(
     rows = []
     for (row, column), total, weight, model in zip(lags, sums, information, unseen, strict=True):
         if weight > 0:
-            value, half = total / weight, 1.959964 * math.hypot(1.0 / math.sqrt(weight), unseen_sd * model / weight)
+            value, half = total / weight, Z95 * math.hypot(1.0 / math.sqrt(weight), unseen_sd * model / weight)
             rows.append(
                 {"lag_row": row, "lag_column": column, "value": value, "low": value - half, "high": value + half}
             )

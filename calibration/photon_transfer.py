@@ -16,6 +16,7 @@ from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..errors import InputError
 from ..generator.line.twin import (
     BAD_PIXEL_CODES,
+    Z95,
     DetectorMaps,
     Estimate,
     Level,
@@ -517,7 +518,7 @@ def _white_fraction(fit: SpreadFit) -> float:
 
 def _root_estimate(variance: float, sd: float, most: float) -> Estimate:
     """Standard deviation with its interval from a variance with its own, which is at most `most`."""
-    half = 1.959964 * sd
+    half = Z95 * sd
     ends = (variance, variance - half, max(min(variance + half, most), variance))
     value, low, high = (math.sqrt(max(v, 0.0)) for v in ends)
     return Estimate(value=value, low=low, high=high)

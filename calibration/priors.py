@@ -118,6 +118,12 @@ PRIORS: dict[str, Prior] = {
         sd=0.5,
         reason="cover, reflector and glue: carbon fibre 0.3 to 1.5 mm, or plastic, beyond what is declared",
     ),
+    "cover_mm_Al": Prior(
+        centre=0.0,
+        sd=0.5,
+        low=0.0,
+        reason="cover not declared: half are of carbon fibre or plastic, without aluminium, half have up to 1 mm",
+    ),
     "dead_layer_um": Prior(
         centre=3.0, sd=4.0, reason="scintillator whose light is lost: starting layers and tips of columns, a few um"
     ),
@@ -190,6 +196,8 @@ def spread_of(prior: Prior) -> float:
     return math.hypot(prior.spread, 0.5 * math.sqrt(square - mean**2))
 
 
+# parameters of a layer that is there or is not, as likely as not: where the Gaussian is negative, it is not
+NONE_OR_SOME = ("cover_mm_Al",)
 # parameters by which a line departs from tables and models, beyond what its sheet or its adjustment leaves open
 DEPARTURES = (
     "kV_tilt",
@@ -197,7 +205,7 @@ DEPARTURES = (
     "yield_exponent",
     "hardness_",
     "anode_roughness_um",
-    "cover_mm_C",
+    "cover_mm_",
     "dead_layer_um",
     "light_",
     "swank_exponent",
@@ -233,6 +241,15 @@ UNDECLARED_SCINTILLATOR = Prior(
 )
 # prior probability of Gd2O2S where nobody says: nothing is known, so CsI has the other half
 GADOLINIUM_SHARE = 0.5
+# of a counter's declared threshold (sd, keV): pixels are trimmed to a keV or so
+THRESHOLD_SD_KEV = 1.0
+UNDECLARED_THRESHOLD = Prior(
+    centre=10.0,
+    sd=10.0,
+    low=0.0,
+    high=60.0,
+    reason="threshold not declared: above noise (4 keV in silicon, 10 in CdTe), 20 to 35 where two energies are counted",
+)
 COUNTING_SWANK = Prior(
     centre=-0.005, sd=0.01, low=-0.1, high=0.0, reason="a counter has no energy-dependent pulse noise"
 )

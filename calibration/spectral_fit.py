@@ -22,6 +22,7 @@ from ..generator.line.spectral_signal import (
     ALTERNATIVE_SCINTILLATOR,
     KERMA_OUTPUT,
     OTHER_TABLES,
+    THRESHOLD,
     OpenBeam,
     SpectralModel,
     SpectrumCorrection,
@@ -53,10 +54,13 @@ from .priors import (
     LEVEL_DISCREPANCY,
     LOG_DISCREPANCY_SD,
     MEASURED_SPECTRUM,
+    NONE_OR_SOME,
     PRIORS,
     SHARES_CORRELATION,
     TABLE_SHARE,
+    THRESHOLD_SD_KEV,
     UNDECLARED_SCINTILLATOR,
+    UNDECLARED_THRESHOLD,
     UNLIKE_OUTPUT,
     Prior,
     ripple_from_latent,
@@ -89,6 +93,8 @@ SHAPE_PARAMETERS = (
     "log_scintillator_thickness",
     "kV_error",
     "escape_scale",
+    *NONE_OR_SOME,
+    THRESHOLD,
     ALTERNATIVE_SCINTILLATOR,
 )
 DEFAULT_SCINTILLATOR = (Filter(material="CsI", thickness_mm=0.5),)
@@ -203,9 +209,13 @@ def geometry_factor(*, source_detector_mm: float | None, pixel_mm: float | None)
 
 
 def priors_for(
-    model: SpectralModel, *, scintillator_declared: bool, geometry_declared: bool = True
+    model: SpectralModel,
+    *,
+    scintillator_declared: bool,
+    geometry_declared: bool = True,
+    threshold_keV: float | None = None,
 ) -> dict[str, Prior]:
-    """The priors of a model's parameters, in the order of its names."""
+    """The priors of a model's parameters, in the order of its names; threshold_keV: that a counter's owner declares."""
     result = {}
     for name in model.names:
         if name == "log_scintillator_thickness" and not scintillator_declared:
@@ -218,6 +228,15 @@ def priors_for(
             result[name] = FREE_OUTPUT
         elif name == "log_swank" and model.counting:
             result[name] = COUNTING_SWANK
+        elif name == THRESHOLD and threshold_keV is not None:
+            result[name] = replace(
+                UNDECLARED_THRESHOLD,
+                centre=threshold_keV,
+                sd=THRESHOLD_SD_KEV,
+                reason="threshold of the counter, as declared",
+            )
+        elif name == THRESHOLD:
+            result[name] = UNDECLARED_THRESHOLD
         elif name == ALTERNATIVE_SCINTILLATOR:
             share = GADOLINIUM_SHARE
             result[name] = Prior(
@@ -258,7 +277,7 @@ def model_for(
         inherent=instrument.inherent_filtration or (),
         scintillator=instrument.scintillator or DEFAULT_SCINTILLATOR,
         alternative=OTHER_SCINTILLATOR if undeclared else (),
-        cover=instrument.detector_cover or (),
+        cover=instrument.detector_cover,
         counting=bool(instrument.counting),
         # the commonest filters carry their uncertainty even where they were not measured
         filter_materials=sorted({*materials, "Al", "Cu"}),
@@ -383,6 +402,7 @@ def fit_spectrum(
     priors = priors_for(
         model,
         scintillator_declared=instrument.scintillator is not None,
+        threshold_keV=instrument.threshold_keV,
         geometry_declared=not known
         or (instrument.pixel_mm is not None and all(level.source_detector_mm for level in known)),
     )
@@ -637,6 +657,7 @@ class _Posterior:
         self.alternative = next(
             (i for i, place in enumerate(self.shape) if names[place] == ALTERNATIVE_SCINTILLATOR), None
         )
+        self.none_or_some = [place for place in self.shape if names[place] in NONE_OR_SOME]
 
     def _share_pairs(self) -> list[tuple[int, int]]:
         """Places among the linear parameters of each material's shares of the two other tables."""
@@ -659,6 +680,8 @@ class _Posterior:
 
             chosen = u[:, self.alternative] > float(ndtri(1.0 - GADOLINIUM_SHARE))
             full[:, self.shape[self.alternative]] = chosen
+        for place in self.none_or_some:
+            full[:, place] = np.maximum(full[:, place], 0.0)
         if self.rippling:
             error, variance = (self.model.names.index(name) for name in ("kV_error", "kV_variance"))
             ripple = ripple_from_latent(u[:, int(np.flatnonzero(self.shape == variance)[0])])

@@ -18,7 +18,7 @@ from ..files import sha256_of_file
 from ..generator.effects import effect_of
 from ..generator.frames.present_line import present_line
 from ..generator.line.measured_flats import measured_flats
-from ..generator.line.twin import Estimate, Twin
+from ..generator.line.twin import Z95, Estimate, Twin
 from ..generator.predictions.predict import predict_flatfield
 from ..results import Result, Table, axes_or_new, counted, frame, plain
 from .frame_sums import effective_frames, sum_frames
@@ -454,8 +454,8 @@ def leave_one_out(
             continue
         mean = rate.value * load_mAs
         variance = slope.value * mean + twin.noise.read_variance_DN2
-        mean_sd = (rate.high - rate.low) / (2 * 1.959964) * load_mAs
-        slope_sd = (slope.high - slope.low) / (2 * 1.959964)
+        mean_sd = rate.sd * load_mAs
+        slope_sd = slope.sd
         rows.append(
             ValidationRow(
                 series=level.name,
@@ -536,6 +536,6 @@ def compared(result: Validation) -> dict[str, list[tuple[str, float, Estimate, s
 
 
 def _widened(estimate: Estimate, sd: float) -> Estimate:
-    below = math.hypot(estimate.value - estimate.low, 1.959964 * sd)
-    above = math.hypot(estimate.high - estimate.value, 1.959964 * sd)
+    below = math.hypot(estimate.value - estimate.low, Z95 * sd)
+    above = math.hypot(estimate.high - estimate.value, Z95 * sd)
     return Estimate(value=estimate.value, low=estimate.value - below, high=estimate.value + above)

@@ -13,7 +13,7 @@ Files:
 """
 
 from ._packaged import is_packaged
-from .detector import DEFAULT_SCINTILLATOR, Response, detector_response, k_escape_fractions
+from .detector import DEFAULT_SCINTILLATOR, Response, counted_fraction, detector_response, k_escape_fractions
 from .effective import effective_mu_per_mm, signal_weights
 from .grid import BIN_WIDTH_KEV, FIRST_CENTRE_KEV, MAXIMUM_KV, energy_grid_keV
 from .light_yield import electron_response, light_per_keV
@@ -53,6 +53,7 @@ __all__ = [
     "Spectrum",
     "air_kerma_uGy_per_mAs",
     "checked_kV",
+    "counted_fraction",
     "detector_response",
     "effective_mu_per_mm",
     "electron_response",

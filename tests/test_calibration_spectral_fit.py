@@ -547,3 +547,63 @@ def test_a_voltage_that_ripples_is_met_by_its_mean_and_variance_together(model, 
         exact = float(np.log(model.signal(truth[None, :], new).rate_DN_per_mAs[0]))
         low, high = np.quantile(draws, [0.025, 0.975])
         assert low < exact < high
+
+
+COUNTER = Instrument(
+    pixel_mm=0.15,
+    source_detector_mm=1059.0,
+    source_object_mm=990.0,
+    counting=True,
+    scintillator=filters_from_text("CdTe:1"),
+)
+
+
+def kerma_of(posterior, beam):
+    """Median and 95 % interval of a beam's air kerma, uGy a mAs at 1 m."""
+    found = model_of_posterior(posterior, highest_kV=beam.kV).signal(posterior.samples, beam)
+    return np.quantile(found.kerma_uGy_per_mAs, [0.5, 0.025, 0.975])
+
+
+def test_the_threshold_of_a_counter_is_found_from_its_flats_and_the_dose_with_it():
+    """A sum over energies of its own: photons that the layer stops and that leave more than 20 keV are counted."""
+    beams = [
+        OpenBeam(kV=kV, filters=filters_from_text(text))
+        for kV in (40.0, 70.0, 110.0)
+        for text in ("", "Al:2", "Cu:0.05")
+    ]
+    tube, energies = SpectralModel(filter_materials=("Al", "Cu")), energy_grid_keV(111.0)
+    best = typical(tube, inherent_filtration_mm_Al=1.5)
+    stopped = transmission(filters_from_text("C:0.5+CdTe:0.003"), energies) * (
+        1.0 - transmission(COUNTER.scintillator, energies)
+    )
+    seen = stopped * (energies > 20.0)
+
+    def photons(beam):
+        found = tube.weights(best[None, :], beam)[0]
+        return np.concatenate([found, np.zeros(energies.size)])[: energies.size]
+
+    flats = [level(beam.kV, beam.filters, float(photons(beam) @ seen), 1.0) for beam in beams]
+    bare = OpenBeam(kV=60.0, filters=())
+    truth = float(tube.signal(best[None, :], bare).kerma_uGy_per_mAs[0])
+    posterior = fit_spectrum(flats, COUNTER, rng=np.random.default_rng(3)).posterior
+    low, high = np.quantile(posterior.column("threshold_keV"), [0.025, 0.975])
+    assert low - 0.5 < 20.0 < high + 0.5
+    assert high - low < 4.0
+    _, low, high = kerma_of(posterior, bare)
+    assert low < truth < high
+
+
+def test_a_cover_that_nobody_declares_widens_the_dose_and_one_declared_does_not(model):
+    beams = [OpenBeam(kV=kV, filters=filters_from_text(text)) for kV in (40.0, 70.0, 110.0) for text in ("", "Al:2")]
+    cover = filters_from_text("Al:0.5")
+    covered = SpectralModel(cover=cover, filter_materials=("Al", "Cu"))
+    best = typical(covered, inherent_filtration_mm_Al=0.3)
+    flats, bare = levels_of(covered, best, beams, np.random.default_rng(5)), OpenBeam(kV=60.0, filters=())
+    truth = float(covered.signal(best[None, :], bare).kerma_uGy_per_mAs[0])
+    width = {}
+    for declared in (None, cover):
+        instrument = replace(INSTRUMENT, detector_cover=declared)
+        _, low, high = kerma_of(fit_spectrum(flats, instrument, rng=np.random.default_rng(6)).posterior, bare)
+        assert low < truth < high
+        width[declared] = math.log(high / low)
+    assert width[cover] < 0.9 * width[None]

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from raytwin.acquisition.setting import Filter, filters_from_text
 from raytwin.errors import InputError
 from raytwin.materials import material_from_name, mu_per_mm, transmission
-from raytwin.spectra import detector_response, energy_grid_keV, k_escape_fractions, tube_spectrum
+from raytwin.spectra import counted_fraction, detector_response, energy_grid_keV, k_escape_fractions, tube_spectrum
+from raytwin.spectra.detector import COUNTER_SD_KEV
 
 GRID = energy_grid_keV(150.0)
 DETECTORS = st.tuples(
@@ -71,6 +72,16 @@ def test_moments_agree_with_photons_followed_one_by_one(name: str, thickness_mm:
     ):
         standard_error = counted.std(ddof=1) / np.sqrt(photons)
         assert abs(counted.mean() - expected) < 4.5 * standard_error + 1e-6 * expected
+
+    # a counter of it, its threshold between what stays with and without the K photon
+    threshold_keV = energy_keV - 0.5 * float(line_keV[0])
+    pulse_keV = deposited_keV[inside] + COUNTER_SD_KEV * rng.standard_normal(int(inside.sum()))
+    share = counted_fraction(
+        energies_keV=[energy_keV],
+        threshold_keV=[threshold_keV],
+        layer=Filter(material=name, thickness_mm=thickness_mm),
+    )[0, 0]
+    assert abs(np.mean(pulse_keV > threshold_keV) - share) < 4.5 * np.sqrt(share * (1.0 - share) / inside.sum())
 
 
 def test_k_lines_of_caesium_iodide_escape_as_published() -> None:

@@ -37,6 +37,7 @@ from ...spectra import (
     MINIMUM_KV,
     MODELS,
     checked_kV,
+    counted_fraction,
     detector_response,
     energy_grid_keV,
     light_per_keV,
@@ -66,19 +67,24 @@ FIXED_PARAMETERS = (
 # second moment of the deposit and in the absorbed share
 RESPONSE_PARAMETERS: dict[str, tuple[float, float, float]] = {
     "cover_mm_C": (1.0, 1.0, 1.0),
+    "cover_mm_Al": (1.0, 1.0, 1.0),
     "dead_layer_um": (1.0, 1.0, 1.0),
     "light_nonproportionality": (1.0, 2.0, 0.0),
     "light_exponent": (1.0, 2.0, 0.0),
     "light_depth_slope": (1.0, 2.0, 0.0),
     "swank_exponent": (0.0, -1.0, 0.0),
 }
-_RESPONSE_OF_COUNTERS = ("cover_mm_C", "dead_layer_um")
+_RESPONSE_OF_COUNTERS = ("cover_mm_C", "cover_mm_Al", "dead_layer_um")
+_OF_UNDECLARED_COVER = "cover_mm_Al"
+THRESHOLD = "threshold_keV"
+# thresholds of counters (node,), keV, between which the counted share is linear
+THRESHOLDS_KEV: NDArray[np.float64] = np.linspace(0.0, 80.0, 161)
 ALTERNATIVE_SCINTILLATOR = "scintillator_alternative"
 # of a tube whose kerma was measured: its output over the flux that the flats saw (fill factor, distances), logarithm
 KERMA_OUTPUT = "log_kerma_over_flats"
 OTHER_TABLES = ("chantler", "penelope")
 # parameters that say nothing of the tube: a dosimeter does not notice them
-_OF_DETECTOR = ("log_DN_per_keV", "log_swank", "scintillator_table", "escape_scale", *RESPONSE_PARAMETERS)
+_OF_DETECTOR = ("log_DN_per_keV", "log_swank", "scintillator_table", "escape_scale", THRESHOLD, *RESPONSE_PARAMETERS)
 _ABSORBER = "absorber_mm:"
 # tube voltages (node,), kV, between which the fluence is linear, half a per cent apart at most: 1e-4 of a signal at 40 kV
 # (behind 0.3 mm of copper 8e-4), a tenth of that from 90 kV on
@@ -176,10 +182,10 @@ class SpectralModel:
     """Tables of one tube and scintillator, from which signals of many parameter sets follow by sums over energy.
 
     `names` are the parameters, in the order of a parameter set; a set of fewer names (an older twin's) can be given, and
-    what it lacks counts as 0. `correction` brings the tube model to measured spectra. `alternative` is another
-    scintillator, which a parameter of value 1 puts in place of the first where the sheet does not say. `secondary_DN` is
-    what secondary quanta add to the variance per signal in every beam. The state is a cache: what each kV and material looks
-    like on the common grid.
+    what it lacks counts as 0. A `cover` of None is not declared: how much aluminium it holds is a parameter. `correction`
+    brings the tube model to measured spectra. `alternative` is another scintillator, which a parameter of value 1 puts in place
+    of the first where the sheet does not say. `secondary_DN` is what secondary quanta add to the variance per signal in every
+    beam. The state is a cache: what each kV and material looks like on the common grid.
     """
 
     def __init__(
@@ -191,7 +197,7 @@ class SpectralModel:
         inherent: Sequence[Filter] = (),
         scintillator: Sequence[Filter] = (Filter(material="CsI", thickness_mm=0.5),),
         alternative: Sequence[Filter] = (),
-        cover: Sequence[Filter] = (),
+        cover: Sequence[Filter] | None = (),
         counting: bool = False,
         filter_materials: Sequence[str] = (),
         highest_kV: float = 160.0,
@@ -205,13 +211,16 @@ class SpectralModel:
         self.inherent = tuple(inherent)
         self.scintillator = tuple(scintillator)
         self.alternative = tuple(alternative)
-        self.cover = tuple(cover)
+        self.cover = tuple(cover or ())
         self.counting = counting
         self.filter_materials = tuple(filter_materials)
         self.correction = correction
         self.secondary_DN = secondary_DN
         every = [*FIXED_PARAMETERS, *(_RESPONSE_OF_COUNTERS if counting else RESPONSE_PARAMETERS)]
+        if cover is not None:
+            every.remove(_OF_UNDECLARED_COVER)
         every += [ALTERNATIVE_SCINTILLATOR] if self.alternative else []
+        every += [THRESHOLD] if counting else []
         for material in self.filter_materials:
             every.append(attenuation_scale_name(material))
             every += [table_share_name(table, material) for table in OTHER_TABLES]
@@ -494,6 +503,13 @@ class SpectralModel:
         by_table, by_escape = (self._column(samples, name)[:, None] for name in ("scintillator_table", "escape_scale"))
         found[0] += by_table * found[2] + by_escape * found[4]
         found[1] += by_table * found[3] + by_escape * found[5]
+        if THRESHOLD in self._index:
+            thresholds = self._column(samples, THRESHOLD)
+            escaping, kept = (
+                _interpolate(THRESHOLDS_KEV, table, thresholds)
+                for table in _counted_tables(self.scintillator[0], self.energies_keV.size)
+            )
+            found *= escaping + by_escape * (escaping - kept)
         powers = self._response_powers(samples, self.energies_keV.size)
         if powers is not None:
             found[::2] *= powers[0]
@@ -746,6 +762,7 @@ def _response_rows(layer: Filter, bins: int) -> dict[str, NDArray[np.float64]]:
     logarithm = np.log(energies / REFERENCE_KEV)
     rows = {
         "cover_mm_C": -_levelled(mu_per_mm(material_from_name("C"), energies), energies),
+        "cover_mm_Al": -_levelled(mu_per_mm(material_from_name("Al"), energies), energies),
         "dead_layer_um": -1e-3 * _levelled(absorber, energies),
         "light_nonproportionality": light_per_keV(layer.material, energies),
         "light_exponent": logarithm,
@@ -788,6 +805,20 @@ def _response_tables(
     result = np.concatenate([escaping, by_table, escaping[:2] - kept[:2]])
     result.setflags(write=False)
     return np.asarray(result)
+
+
+@lru_cache(maxsize=16)
+def _counted_tables(layer: Filter, bins: int) -> NDArray[np.float64]:
+    """Share of the photons that interact in a counter's layer which it counts (2, node of threshold, energy).
+
+    The first where all K photons that a slab lets out leave, the second where none does.
+    """
+    energies = energy_grid_keV(500.0)[:bins]
+    tables = [
+        counted_fraction(energies_keV=energies, threshold_keV=THRESHOLDS_KEV, layer=layer, escape=escape)
+        for escape in (True, False)
+    ]
+    return np.array(tables)
 
 
 def _brackets(nodes: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

@@ -153,11 +153,6 @@ def _write_table(path: Path, columns: Mapping[str, Sequence[Any] | FloatArray]) 
             writer.writerow([f"{value:.9g}" if isinstance(value, float) else value for value in row])
 
 
-def _write_json(path: Path, data: Mapping[str, Any]) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
 def _write_lines(path: Path, lines: Sequence[str]) -> None:
     with whole_file(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -227,7 +222,7 @@ def _to_csv(line: _Line, folder: Path) -> tuple[dict[str, str], tuple[str, ...]]
             "gain_DN_high": [level.gain_DN.high for level in levels],
         },
     )
-    _write_json(folder / "noise.json", _detector_of(line))
+    write_json(folder / "noise.json", _detector_of(line))
     return files, ()
 
 
@@ -265,9 +260,9 @@ def _to_gvxr(line: _Line, folder: Path) -> tuple[dict[str, str], tuple[str, ...]
             "Samples": [],
             "raytwin": {"setting": str(setting)},
         }
-        _write_json(folder / name, page)
+        write_json(folder / name, page)
         files[name] = f"source and detector at {setting}"
-    _write_json(folder / "noise.json", detector)
+    write_json(folder / "noise.json", detector)
     missing = tuple(
         f"{name} is unknown: {usual} stands in its place"
         for name, usual in (("source_detector_mm", "1 m"), ("pixel_mm", "1 mm"))
@@ -325,7 +320,7 @@ def _to_xcist(line: _Line, folder: Path) -> tuple[dict[str, str], tuple[str, ...
     lines += [f"scanner.detectorColCount = {detector['columns']}", f"scanner.detectorRowCount = {detector['rows']}"]
     _write_lines(folder / "scanner.cfg", lines)
     files["scanner.cfg"] = "detector"
-    _write_json(folder / "noise.json", {**detector, "line_spread": line.kernel})
+    write_json(folder / "noise.json", {**detector, "line_spread": line.kernel})
     # gecatsim's Detection_EI: a photon that interacts at all leaves all of its energy
     stopped = 1.0 - np.exp(-depth_mm * mu_per_mm(material_from_name(layer.material), line.energies_keV))
     told = []
@@ -349,7 +344,7 @@ def _to_leap(line: _Line, folder: Path) -> tuple[dict[str, str], tuple[str, ...]
             detected_spectra=line.photons * line.signal_DN,
         )
     pitch = detector["pixel_mm"]
-    _write_json(
+    write_json(
         folder / "leap_geometry.json",
         {
             "numRows": detector["rows"],
@@ -363,7 +358,7 @@ def _to_leap(line: _Line, folder: Path) -> tuple[dict[str, str], tuple[str, ...]
             "settings": [str(setting) for setting in line.settings],
         },
     )
-    _write_json(folder / "noise.json", detector)
+    write_json(folder / "noise.json", detector)
     files = {
         "leap_spectra.npz": "Es (keV), spectra (photons a bin, mAs and mm2 at 1 m), detector_response (DN a photon), their product",
         "leap_geometry.json": "arguments of set_conebeam",

@@ -138,7 +138,11 @@ def equivalent_filtration(spectral: SpectralPosterior, *, seen_by_detector: bool
     """
     layers = [("anode_roughness_um", spectral.anode, 1e-3)]
     if seen_by_detector:
-        layers += [("cover_mm_C", "C", 1.0), ("dead_layer_um", spectral.scintillator[0].material, 1e-3)]
+        layers += [
+            ("cover_mm_C", "C", 1.0),
+            ("cover_mm_Al", "Al", 1.0),
+            ("dead_layer_um", spectral.scintillator[0].material, 1e-3),
+        ]
     total = spectral.column("inherent_filtration_mm_Al").copy()
     for name, material, unit_mm in layers:
         if name in spectral.names:

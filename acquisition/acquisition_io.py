@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileFormatError, InputError
+from ..errors import FileFormatError, InputError, check_number
 from ..files import whole_file
 from ..results import Table, counted
 from ._hdf5 import (
@@ -771,7 +771,14 @@ class AcquisitionWriter:
             dtype: uint16 or float32; by default uint16 for integers and float32 for the rest.
             chunk_frames: frames a chunk of the file holds; by default 1, more where frames are tiny.
             index: order in time; by default after the series added before.
-            setting: the setting as one value; or the single attributes instead, each None where unknown.
+            setting: the setting as one value; or the single attributes instead, each None where unknown: kV; exposure_ms;
+                current_mA or power_W; filters; averaged (frames averaged into each); frame_interval_ms; belt_speed_mm_s.
+            panel_rotation_deg: of the panel about its normal.
+            source_object_mm, source_detector_mm: where they are not the instrument's.
+            photons_per_pixel: of light whose photons were counted otherwise (EMVA 1288).
+            scene: name of a scene added before; empty: the open beam.
+            corrected: what was done to the frames (`offset`, `gain`, `defects`, `log`).
+            role: `calibration` or `evaluation`; None: either.
             layer: `front` or `back`, of a dual-layer panel.
             time_s: (n,) times of the frames in s, where they are known.
 
@@ -791,6 +798,10 @@ class AcquisitionWriter:
             )
         if role is not None and role not in ROLES:
             raise InputError(f"role of series {name}", received=repr(role), expected="one of " + ", ".join(ROLES))
+        if kind in ("flat", "object"):
+            for label, value in (("kV", kV), ("current_mA", current_mA), ("power_W", power_W)):
+                if value is not None:
+                    check_number(f"{label} of series {name}", value)
         group = self._series.create_group(name)
         number = self._next_index if index is None else int(index)
         self._next_index = max(self._next_index, number + 1)

@@ -1,8 +1,15 @@
-"""Which series of a session calibrate."""
+"""Which series of a session calibrate, and what shape of frame it has."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 from .acquisition_io import Series
+
+
+def commonest_shape(series: Sequence[Series]) -> tuple[int, int] | None:
+    """The shape (rows, columns) that most series have, the first of equals; None without any."""
+    counted = Counter(item.shape for item in series)
+    return counted.most_common(1)[0][0] if counted else None
 
 
 def calibrating_names(series: Sequence[Series]) -> frozenset[str]:

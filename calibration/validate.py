@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..acquisition.cut_off import without_cut_off_darks
@@ -265,11 +266,7 @@ def validate_twin(
     good = twin.maps.bad_pixels == 0
     rho = twin.noise.spread.value.noise_autocovariance(_LAGS)
     squared_correlations = float(np.sum(rho**2)) / float(rho[_LAGS, _LAGS]) ** 2
-    darks = {
-        item.exposure_ms: sum_frames(item.iter_frames(), name=f"series {item.name}").mean_DN
-        for item in acquisition.of_kind("dark")
-        if not item.corrected
-    }
+    darks = _dark_means(acquisition)
     calibrated = {name for level in twin.levels for name in level.series}
     same_session = sha256_of_file(acquisition.path) in str(twin.provenance.get("acquisition_sha256", "")).split("+")
     rows, skipped = [], [*cut_off]
@@ -283,7 +280,7 @@ def validate_twin(
             continue
         total = sum_frames(item.iter_frames(), name=f"series {item.name}")
         if total.frames < 2:
-            skipped.append(f"{item.name}: a single frame has no noise, its level alone is compared")
+            skipped.append(f"{item.name}: its noise, which a single frame does not show")
         if "offset" in item.corrected:
             dark: Any = 0.0
         else:
@@ -349,6 +346,19 @@ def validate_twin(
             expected="at least one flat with kV, exposure and tube load that the twin can predict",
         )
     return Validation(rows=tuple(rows), skipped=tuple(skipped), wedges=wedges)
+
+
+def _dark_means(acquisition: AcquisitionFile) -> dict[float | None, NDArray[np.float64]]:
+    """Mean dark frame (row, column), DN, by exposure: of all raw darks of that exposure, each by its frames."""
+    found: dict[float | None, list[tuple[NDArray[np.float64], float]]] = {}
+    for item in acquisition.of_kind("dark"):
+        if not item.corrected:
+            total = sum_frames(item.iter_frames(), name=f"series {item.name}")
+            found.setdefault(item.exposure_ms, []).append((total.mean_DN, float(total.frames * item.averaged)))
+    return {
+        exposure_ms: np.average([mean for mean, _ in means], axis=0, weights=[weight for _, weight in means])
+        for exposure_ms, means in found.items()
+    }
 
 
 def _wedge_rows(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
-from ..acquisition.series_roles import calibrating_names
+from ..acquisition.series_roles import calibrating_names, commonest_shape
 from ..calibration.bad_pixels import is_noisy
 from ..calibration.code_steps import code_step
 from ..calibration.frame_checks import LEVEL_CHANGE, SceneChange
@@ -346,9 +346,10 @@ def _session_findings(
     elif "dark" not in kinds and not acquisition.instrument.counting and not corrected:
         found.append(Finding(code=FindingCode.NO_DARK))
     imaged = [item for item in read if item.kind in ("dark", "flat")]
-    for item in imaged[1:]:
-        reference = imaged[0]
-        if item.shape != reference.shape:
+    shape = commonest_shape(imaged)
+    for item in imaged:
+        if item.shape != shape:
+            reference = next(other for other in imaged if other.shape == shape)
             found.append(
                 Finding(
                     code=FindingCode.SHAPES,

@@ -61,6 +61,10 @@ class FindingCode(enum.StrEnum):
     NO_SIDECAR = "no_sidecar"
 
 
+# findings on series that contradict each other though every label may be right
+NOT_OF_LABELS = (FindingCode.SPECTRUM, FindingCode.STOPS)
+
+
 @dataclass(frozen=True, slots=True)
 class _Entry:
     severity: Severity

@@ -170,7 +170,8 @@ def test_advice_says_how_far_voltages_carry_and_what_each_kind_of_measurement_br
     reading = by_kind["dose"][0]
     # a third voltage narrows levels and noise; one reading of dose fixes the output, which levels hardly ask for
     assert third["shrinks_to"] < 0.8 < reading["shrinks_to"] <= 1.0 + 1e-9
-    assert reading["dose_shrinks_to"] < 0.5 < third["dose_shrinks_to"]
+    # a cover that nobody declared leaves open how the dose goes with the beam
+    assert reading["dose_shrinks_to"] < 0.75 < third["dose_shrinks_to"]
 
 
 def test_one_kV_is_told_to_measure_another(model, truth):

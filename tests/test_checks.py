@@ -171,6 +171,17 @@ def test_lines_of_a_line_camera_are_told_to_be_stacked(broken, tmp_path):
     assert not any(row.serves_for for row in result.series)
 
 
+def test_a_series_of_another_shape_is_told_and_not_those_it_differs_from(session, tmp_path):
+    with copy_of(session, tmp_path) as (path, file):
+        order = sorted(file["series"], key=lambda name: int(file["series"][name].attrs["index"]))
+        group = file["series"][order[0]]
+        frames = group["frames"][()][:, :-2]
+        del group["frames"]
+        group["frames"] = frames
+    found = check_acquisition(path).findings
+    assert [item.series for item in found if item.code is FindingCode.SHAPES] == [order[0]]
+
+
 def test_the_json_answer_holds_what_scripts_read(session, capsys):
     assert main(["check", str(session), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)

@@ -13,8 +13,9 @@ from raytwin.cli import main
 from raytwin.diagnosis.model.changes import variants_of
 from raytwin.diagnosis.probes.registration import render_variance
 from raytwin.diagnosis.session import binning
+from raytwin.diagnosis.session.binned_twin import effect_in_squares
 from raytwin.diagnosis.session.binning import LARGEST_PIXELS, LEAST_SIDE, bin_factor, parameters_in_pixels
-from raytwin.generator.effects import EFFECTS
+from raytwin.generator.effects import EFFECTS, AppliedEffect
 
 
 @given(rows=st.integers(1, 5000), columns=st.integers(1, 5000))
@@ -55,6 +56,14 @@ def test_strengths_found_with_squares_are_those_of_the_pixels():
         "strength": 5.0,
         "reach_px": 6.0,
     }
+
+
+@pytest.mark.parametrize("effect", sorted(EFFECTS))
+def test_pictures_of_squares_are_drawn_with_what_was_found_in_squares(effect):
+    entry = EFFECTS[effect]
+    found = {item.name: min(1.3 * item.default, 0.9 * item.most) for item in entry.parameters}
+    applied = AppliedEffect(id=effect, parameters=parameters_in_pixels(effect, found, 4))
+    assert effect_in_squares(applied, 4).parameters == pytest.approx(found)
 
 
 def test_ranges_of_lengths_and_shares_are_those_of_the_panel_s_pixels():

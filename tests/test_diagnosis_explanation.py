@@ -10,6 +10,7 @@ from raytwin.diagnosis.diagnose_session import _with_findings
 from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis
 from raytwin.diagnosis.judgement.answer import Cause, Diagnosis, Place
 from raytwin.diagnosis.judgement.held_out import Gap
+from raytwin.diagnosis.judgement.judgement import verdict_of
 from raytwin.diagnosis.report.explanation import location_text, paragraph, title_of
 from raytwin.diagnosis.report.report import next_steps
 
@@ -160,6 +161,30 @@ def test_a_session_whose_numbers_stop_early_has_a_gap_whatever_the_rest_says():
     assert _with_findings(agreed, ()) == agreed
 
 
+@pytest.mark.parametrize(
+    ("weighed", "word", "leading", "tied"),
+    [
+        ({"a": 0.70, "": 0.30}, "explained", "a", []),
+        ({"a": 0.35, "a b": 0.33, "": 0.32}, "explained", "a", []),
+        ({"a": 0.59, "": 0.41}, "ambiguous", "a", ["a"]),
+        ({"a": 0.55, UNKNOWN: 0.44, "b": 1e-9}, "ambiguous", "a", ["a"]),
+        ({"a": 0.50, "b": 0.45, "c": 0.05}, "ambiguous", "a", ["a", "b"]),
+        ({UNKNOWN: 0.50, "a": 0.45, "": 0.05}, "unknown_effect", UNKNOWN, []),
+        ({"": 0.60, "a": 0.40}, "no_gap", "", []),
+    ],
+)
+def test_an_effect_is_named_from_six_tenths_on_and_tied_ones_hold_nine(weighed, word, leading, tied):
+    items = tuple(
+        Hypothesis(effects=tuple(names.split()), probability=probability, log_evidence=0.0)
+        for names, probability in weighed.items()
+    )
+    found = verdict_of(items)
+    assert (found.word, " ".join(found.leading.effects)) == (word, leading)
+    assert [" ".join(item.effects) for item in found.tied] == tied
+    bent = tuple(replace(item, misfit="flats") for item in items)
+    assert verdict_of(bent).word == ("explained_in_part" if word == "explained" else word)
+
+
 def test_a_tie_names_its_members_and_the_measurement_that_would_break_it():
     """What is not in the catalogue among them, and two effects at once as one explanation."""
     tied = [
@@ -168,7 +193,7 @@ def test_a_tie_names_its_members_and_the_measurement_that_would_break_it():
     ]
     text = paragraph(diagnosis("ambiguous", hypotheses=tied, next_measurement={"text": "take beam-off frames"}))
     both = f"{title_of('image_lag')} with {title_of('dark_drift')} (0.50)"
-    assert f"what causes it: {both}, an effect that is not in the catalogue (0.40)." in text
+    assert f"what causes it: {both}, an effect that is not in the catalogue (0.40), no effect (0.10)." in text
     assert text.rstrip(".").endswith("To tell them apart: take beam-off frames")
 
 

@@ -100,6 +100,9 @@ def proposal_text(proposal: Proposal, first: Sequence[str], second: Sequence[str
     )
 
 
+_Scene = tuple[str, dict[str, NDArray[np.float64]]]  # kind, and thickness maps (row, column), mm, by material
+
+
 @dataclass(frozen=True, slots=True)
 class _Line:
     """What a session says of how it measures: a usual setting of each voltage, the twin, distances, the product's material."""
@@ -142,7 +145,7 @@ def _line_of(problem: Problem) -> _Line | None:
     )
 
 
-def _scenes(shape: tuple[int, int], material: str) -> dict[str, tuple[str, dict[str, NDArray[np.float64]]]]:
+def _scenes(shape: tuple[int, int], material: str) -> dict[str, _Scene]:
     """Name -> kind and thickness maps (row, column), mm."""
     rows, columns = shape
     y, x = np.mgrid[:rows, :columns].astype(np.float64)
@@ -325,6 +328,8 @@ def best_measurement(
             path = Path(folder) / "planned.h5"
             begin_s = max(view.session.request.start_s for view in problem.views) + _LATER_S
             members = _write(path, line, planned, begin_s, rng)
+            if not members:
+                return None  # the twin can draw none of them: a repeat or the table of what isolates effects is named instead
             with open_acquisition(path) as acquisition:
                 taken = build_problem(
                     acquisition,
@@ -337,7 +342,7 @@ def best_measurement(
         return None  # the twin cannot draw them: a repeat or the table of what isolates effects is named instead
     now = _separation(problem, None, np.zeros(0, dtype=np.intp), first, second)
     proposals = []
-    for measurement in planned:
+    for measurement in (item for item in planned if item.name in members):
         names = members[measurement.name]
         rows = np.array(
             [index for index, number in enumerate(taken.series_of) if taken.views[number].session.name in names],
@@ -358,57 +363,73 @@ def _fixed(problem: Problem, variant: Variant, strength: float) -> Variant:
 def _write(
     path: Path, line: _Line, planned: Sequence[Measurement], begin_s: float, rng: np.random.Generator
 ) -> dict[str, frozenset[str]]:
-    """Measure with the twin from a time in the session on; the names of each measurement's series."""
-    twin = line.twin
-    scenes = _scenes(twin.maps.shape, line.material)
+    """Measure with the twin from a time in the session on; the names of each measurement's series, of those it can draw."""
+    scenes = _scenes(line.twin.maps.shape, line.material)
     members: dict[str, frozenset[str]] = {}
-    clock = begin_s
-    with write_acquisition(path, twin.instrument) as file:
+    clock_s, number = begin_s, 0
+    with write_acquisition(path, line.twin.instrument) as file:
         for name, (kind, maps) in scenes.items():
             file.add_scene(name, kind=kind, thickness_mm=maps)
-        number = 0
         for measurement in planned:
+            try:
+                drawn, clock_s = _drawn(line, measurement, scenes, clock_s, rng)
+            except RaytwinError:
+                continue
             names = []
-            previous: tuple[SeriesRequest, ...] = ()
-            for item in measurement.series:
-                scene = scenes.get(item.scene)
-                request = SeriesRequest(
-                    kind=item.kind,
-                    setting=item.setting,
-                    frames=FRAMES,
-                    exposure_ms=item.exposure_ms,
-                    start_s=clock,
-                    thickness_mm=None if scene is None else scene[1],
-                    scene_kind=None if scene is None else scene[0],
-                    source_object_mm=item.source_object_mm or twin.instrument.source_object_mm,
-                    source_detector_mm=twin.instrument.source_detector_mm,
-                    panel_rotation_deg=item.panel_rotation_deg,
-                    previous=previous,
-                )
-                step_s = request.interval_s(twin.instrument.readout_ms) * request.exposures_per_frame
+            for item, request, frames in drawn:
                 number += 1
-                name = f"{number} {measurement.name}"
+                names.append(f"{number} {measurement.name}")
                 file.add_series(
-                    name,
+                    names[-1],
                     kind=item.kind,
                     setting=request.setting,
                     exposure_ms=None if request.setting is not None else item.exposure_ms,
                     dtype=np.float32,
-                    frames=np.stack(list(LineModel(twin, use_measured_level=False).sample(request, rng=rng))),
+                    frames=frames,
                     scene=item.scene,
                     source_object_mm=item.source_object_mm,
                     panel_rotation_deg=item.panel_rotation_deg or None,
-                    time_s=clock + step_s * np.arange(FRAMES),
+                    time_s=request.start_s + _step_s(line, request) * np.arange(FRAMES),
                 )
-                names.append(name)
-                clock += FRAMES * step_s
-                if item.kind == "flat":
-                    previous = (replace(request, previous=()),)
-                if measurement.name != "afterglow":
-                    clock += _PAUSE_S
-            clock += _PAUSE_S
             members[measurement.name] = frozenset(names)
     return members
+
+
+def _drawn(
+    line: _Line, measurement: Measurement, scenes: Mapping[str, _Scene], clock_s: float, rng: np.random.Generator
+) -> tuple[list[tuple[PlannedSeries, SeriesRequest, NDArray[np.float32]]], float]:
+    """Series of a measurement with their frames (frame, row, column), DN, begun at a time in the session; and when it ends."""
+    instrument = line.twin.instrument
+    found = []
+    previous: tuple[SeriesRequest, ...] = ()
+    for item in measurement.series:
+        scene = scenes.get(item.scene)
+        request = SeriesRequest(
+            kind=item.kind,
+            setting=item.setting,
+            frames=FRAMES,
+            exposure_ms=item.exposure_ms,
+            start_s=clock_s,
+            thickness_mm=None if scene is None else scene[1],
+            scene_kind=None if scene is None else scene[0],
+            source_object_mm=item.source_object_mm or instrument.source_object_mm,
+            source_detector_mm=instrument.source_detector_mm,
+            panel_rotation_deg=item.panel_rotation_deg,
+            previous=previous,
+        )
+        frames = np.stack(list(LineModel(line.twin, use_measured_level=False).sample(request, rng=rng)))
+        found.append((item, request, frames))
+        clock_s += FRAMES * _step_s(line, request)
+        if item.kind == "flat":
+            previous = (replace(request, previous=()),)
+        if measurement.name != "afterglow":
+            clock_s += _PAUSE_S
+    return found, clock_s + _PAUSE_S
+
+
+def _step_s(line: _Line, request: SeriesRequest) -> float:
+    """Time from frame to frame of a series, s."""
+    return request.interval_s(line.twin.instrument.readout_ms) * request.exposures_per_frame
 
 
 def _separation(

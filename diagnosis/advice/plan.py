@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import InputError
 from ...generator.effects import EFFECTS
 from ..inference.nuisances import Nuisances, Whitening
 from ..model.curves import Curve
@@ -46,6 +47,13 @@ def distinguishability(problem: Problem) -> Distinguishability:
     """How well the session of a problem tells the catalogue's effects apart."""
     whitening = Whitening(problem.factors, problem.blocks)
     curves = whitening.curves(problem.curves)
+    if not curves:
+        raise InputError(
+            "session",
+            received="no effect of the catalogue that could change what was measured",
+            expected="one at least",
+            remedy="leave fewer effects out, or measure flats and objects too",
+        )
     nodes = np.concatenate([curve.responses for curve in curves])
     gram = Nuisances(whitening.factors).inner(nodes, nodes)
     places: list[slice] = []

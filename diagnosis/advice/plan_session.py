@@ -8,6 +8,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ...acquisition.acquisition_io import AcquisitionFile
+from ...checks.findings import NOT_OF_LABELS, Finding
 from ...generator.effects import EFFECTS
 from ...generator.line.twin import Twin
 from ...results import Result, Table, axes_or_new, frame, plain
@@ -24,13 +25,13 @@ if TYPE_CHECKING:
 class SessionPlan(Result):
     """Which effects a session distinguishes.
 
-    Fields: distinguishability; cannot_be_judged (effect -> reason); mislabelled: lines on series whose frames contradict a label, by
-    which the plan goes all the same.
+    Fields: distinguishability; cannot_be_judged (effect -> reason); findings: on series that contradict what they
+    state, by which the plan goes all the same.
     """
 
     distinguishability: Distinguishability
     cannot_be_judged: Mapping[str, str]
-    mislabelled: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """What `raytwin diagnose --plan --json` prints."""
@@ -45,7 +46,8 @@ class SessionPlan(Result):
                 "seen_from": found.seen_from,
                 "between": found.between,
                 "cannot_be_judged": self.cannot_be_judged,
-                "mislabelled": self.mislabelled,
+                "mislabelled": [item.line for item in self.findings if item.code not in NOT_OF_LABELS],
+                "findings": [item.line for item in self.findings],
             }
         )
         return answer
@@ -85,7 +87,7 @@ class SessionPlan(Result):
         )
         notes = (
             *(f"{effect} cannot be judged: {reason}" for effect, reason in self.cannot_be_judged.items()),
-            *(f"finding: {line}" for line in self.mislabelled),
+            *(f"finding: {item.line}" for item in self.findings),
         )
         title = f"{len(rows)} effects that these series can show"
         return Table(title=title, header=("effect", "since", "seen from"), rows=rows, notes=notes)
@@ -117,5 +119,5 @@ def plan_session(
     return SessionPlan(
         distinguishability=replace(found, strengths=found.strengths * shares, seen_from=found.seen_from * shares),
         cannot_be_judged={**problem.missing_effects, **unseen},
-        mislabelled=tuple(item.line for item in (*session.findings, *session.other_findings)),
+        findings=(*session.findings, *session.other_findings),
     )

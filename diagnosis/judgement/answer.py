@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
-from ...checks.findings import Finding, FindingCode
+from ...checks.findings import NOT_OF_LABELS, Finding
 from ...errors import InputError
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.line.twin import Twin
@@ -295,7 +295,7 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any] | None =
         "mislabelled": [
             {"series": list(item.names), "text": item.line}
             for item in diagnosis.findings
-            if item.code is not FindingCode.STOPS
+            if item.code not in NOT_OF_LABELS
         ],
         "findings": [
             {"code": str(item.code), "series": list(item.names), "text": item.text} for item in diagnosis.findings

@@ -29,6 +29,7 @@ from .held_out import held_out
 from .strengths import applied_at_best, strength_of
 
 EXPLAINED_FROM = 0.6  # probability of an effect (over all hypotheses) from which it is named as the explanation
+_TIED_HOLD = 0.9  # probability that the hypotheses which are tied hold together, none and an unknown effect counted
 _WORST_PLACES = 30
 _MUCH = 0.5  # of the gap that an effect removes to be listed, though an unknown one is likelier
 _WORTH_LISTING = 0.02  # probability of an effect that is neither named nor tied
@@ -242,15 +243,13 @@ def verdict_of(hypotheses: tuple[Hypothesis, ...]) -> Verdict:
     elif core == set(leading.effects):
         word = "explained_in_part" if leading.misfit else "explained"
     else:
-        total = 0.0
+        word, total = "ambiguous", 0.0
         for item in hypotheses:
             if item.effects and item.effects != (UNKNOWN,):
                 tied.append(item)
             total += item.probability
-            if total > 0.9 and len(tied) > 1:
+            if total > _TIED_HOLD:
                 break
-        several = len({effect for item in tied for effect in item.effects}) > 1
-        word = "ambiguous" if several else "explained"
     return Verdict(word=word, hypotheses=hypotheses, leading=leading, tied=tuple(tied))
 
 
@@ -420,9 +419,10 @@ def _out_of_reach(problem: Problem, curves: Sequence[Curve], observed: Observed)
     found = dict(problem.missing_effects)
     for effect, (length, high) in farthest.items():
         if length < SEEN_FROM:
+            strength = EFFECTS[effect].strength
             found[effect] = (
-                f"at {high:g} {EFFECTS[effect].strength.unit}, the largest plausible, it would lie {length:.1f} standard"
-                " deviations from nothing in these series"
+                f"at {high * strength.pixels_per_bin(problem.side):g} {strength.unit}, the largest plausible, it would lie"
+                f" {length:.1f} standard deviations from nothing in these series"
             )
     return {effect: found[effect] for effect in EFFECTS if effect in found}
 

@@ -247,7 +247,7 @@ class SessionModel:
     def with_scene(self, one: SeriesModel, thickness_mm: Mapping[str, NDArray[np.floating]], asked: Asked) -> Moved:
         """What another scene would show in a series (`under` the change that is asked), less what its own shows there."""
         change, request = self._found(one, asked.change)
-        changed = self.model.under(change, replace(request, thickness_mm=dict(thickness_mm)))
+        changed = self.model.under(change, replace(request, thickness_mm=thickness_mm))
         moved = np.asarray(np.asarray(changed.mean_DN) - np.asarray(one.expected.mean_DN), dtype=np.float32)
         return moved / asked.absorbed.divides, expected_scalars(changed, one.context)
 

@@ -198,8 +198,8 @@ def findings_title(diagnosis: Diagnosis) -> str:
 
 def rivals(diagnosis: Diagnosis) -> list[tuple[str, float]]:
     """Explanations that are not out of the question, in words, and their probabilities, most probable first."""
-    likely = [item for item in diagnosis.hypotheses if item.effects and item.probability >= _LEAST_LIKELY]
-    return [(" with ".join(map(title_of, item.effects)), item.probability) for item in likely[:_RIVALS]]
+    likely = [item for item in diagnosis.hypotheses if item.probability >= _LEAST_LIKELY]
+    return [(" with ".join(map(title_of, item.effects)) or "no effect", item.probability) for item in likely[:_RIVALS]]
 
 
 def fall_text(gap: Gap) -> str:

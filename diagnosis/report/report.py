@@ -12,6 +12,7 @@ from ...generator.effects import EFFECTS
 from ...reports import Figure, SortedTable, write_page
 from ..judgement.answer import Cause, Diagnosis
 from ..problem.assemble import map_changes
+from ..session.binned_twin import effect_in_squares
 from .explanation import (
     axis_text,
     compared_text,
@@ -33,11 +34,11 @@ _SINCE = {"calibration": "since the calibration"}
 
 
 def residuals_after(diagnosis: Diagnosis) -> list[NDArray[np.float32]]:
-    """Residual maps of each series with the leading hypothesis' effects added, DN."""
+    """Residual maps of each series with the leading hypothesis' effects added, DN; of the squares that were compared."""
     problem = diagnosis.compared
     if not diagnosis.added:
         return [view.residual_DN for view in problem.views]
-    changes = map_changes(problem, diagnosis.added)
+    changes = map_changes(problem, [effect_in_squares(item, problem.side) for item in diagnosis.added])
     return [
         np.asarray(view.residual_DN - change, dtype=np.float32)
         for view, change in zip(problem.views, changes, strict=True)

@@ -45,7 +45,7 @@ def binned_twin(twin: Twin, factor: int) -> Twin:
         noise=noise,
         levels=tuple(_level(level, noise, factor) for level in twin.levels),
         spectral=None if twin.spectral is None else _spectral(twin.spectral, factor, pitch_known=pitch is not None),
-        effects=tuple(_effect(item, factor) for item in twin.effects),
+        effects=tuple(effect_in_squares(item, factor) for item in twin.effects),
     )
 
 
@@ -125,8 +125,8 @@ def _spectral(spectral: SpectralPosterior, factor: int, *, pitch_known: bool) ->
     return replace(spectral, samples=per_bin(spectral.samples), best=per_bin(spectral.best))
 
 
-def _effect(item: AppliedEffect, factor: int) -> AppliedEffect:
-    """An effect that the twin has, with lengths in squares; what it does not state has its default, in pixels."""
+def effect_in_squares(item: AppliedEffect, factor: int) -> AppliedEffect:
+    """An effect in terms of pixels, with lengths in squares; what it does not state has its default, in pixels."""
     if item.id not in EFFECTS:
         return item
     effect = EFFECTS[item.id]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ...acquisition.acquisition_io import AcquisitionFile, Series
 from ...acquisition.binned_frames import binned
 from ...acquisition.cut_off import share_of_zeros, without_cut_off_darks
-from ...acquisition.series_roles import calibrating_names
+from ...acquisition.series_roles import calibrating_names, commonest_shape
 from ...calibration.calibrate import calibrate_twin
 from ...calibration.repeated_frames import beam_of
 from ...checks.findings import Finding, FindingCode
@@ -253,12 +253,12 @@ def _without_spectrum(acquisition: AcquisitionFile, twin: Twin) -> tuple[Finding
 
 def _of_one_shape(acquisition: AcquisitionFile, twin: Twin | None) -> tuple[AcquisitionFile, list[str]]:
     """The series whose frames have the twin's shape, or the commonest one; and which were left out."""
-    if not acquisition.series:
+    commonest = commonest_shape(acquisition.series)
+    if commonest is None:
         raise InputError(f"acquisition {acquisition.path}", received="no series", expected="darks and flats at least")
-    counted = Counter(item.shape for item in acquisition.series)
-    shape = counted.most_common(1)[0][0] if twin is None else twin.maps.shape
-    if shape not in counted:
-        rows, columns = counted.most_common(1)[0][0]
+    shape = commonest if twin is None else twin.maps.shape
+    if all(item.shape != shape for item in acquisition.series):
+        rows, columns = commonest
         raise InputError(
             f"acquisition {acquisition.path}",
             received=f"frames of {rows} x {columns}",

@@ -276,7 +276,7 @@ def diagnose(
             _write(found, folder)
             if asked is not None:
                 found = replace(
-                    found, task=_run_task(found, *asked, folder=folder / "task", device=device, telling=telling)
+                    found, task=_run_task(found, known, *asked, folder=folder / "task", device=device, telling=telling)
                 )
                 _write(found, folder)
     return found
@@ -326,10 +326,17 @@ def _task(task: Mapping[str, Any], *, seed: int, device: str) -> "tuple[TaskInpu
 
 
 def _run_task(
-    found: "Diagnosis", brought: "TaskInput", plan: "TaskPlan", *, folder: Path, device: str, telling: Telling
+    found: "Diagnosis",
+    known: "Twin | None",
+    brought: "TaskInput",
+    plan: "TaskPlan",
+    *,
+    folder: Path,
+    device: str,
+    telling: Telling,
 ) -> dict[str, Any]:
     from ..campaign.task import run_task
     from ..segmentation import choose_device
 
-    before = replace(found.twin, effects=tuple(item for item in found.twin.effects if item not in found.added))
+    before = replace(found.twin, effects=() if known is None else known.effects)
     return run_task(before, found.twin, brought, folder, plan=plan, device=choose_device(device), tell=telling.stage)

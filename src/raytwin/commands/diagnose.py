@@ -111,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
             progress=bar,
         )
     if isinstance(found, SessionPlan):
-        for line in found.mislabelled:
+        for line in (item.line for item in found.findings):
             say(f"finding: {line}")
         missing = [f"{effect} cannot be judged: {reason}" for effect, reason in found.cannot_be_judged.items()]
         text = "\n".join([table_text(found.distinguishability), *missing])

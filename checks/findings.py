@@ -96,7 +96,7 @@ _ENTRIES: dict[FindingCode, _Entry] = {
     ),
     FindingCode.NO_KV: _Entry(
         Severity.WARNING,
-        "{count} flats state a current or power and no kV: flats of several voltages cannot be told apart, and nothing is known of"
+        "{count} flats state a current or power and no kV: flats of several voltages cannot be distinguished, and nothing is known of"
         " the spectrum; write the kV of every flat",
     ),
     FindingCode.MISSING: _Entry(Severity.NOTE, "{what}"),
@@ -133,7 +133,7 @@ _ENTRIES: dict[FindingCode, _Entry] = {
     ),
     FindingCode.OFFSET_CORRECTED: _Entry(
         Severity.ERROR,
-        "the dark level is {level:.3g} DN and values are negative: the dark is taken off already; declare"
+        "the dark level is {level:.3g} DN and values are negative: the dark is subtracted already; declare"
         ' corrected = "offset"',
     ),
     FindingCode.FLAT_CORRECTED: _Entry(

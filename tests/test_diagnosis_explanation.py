@@ -194,7 +194,7 @@ def test_a_tie_names_its_members_and_the_measurement_that_would_break_it():
     text = paragraph(diagnosis("ambiguous", hypotheses=tied, next_measurement={"text": "take beam-off frames"}))
     both = f"{title_of('image_lag')} with {title_of('dark_drift')} (0.50)"
     assert f"what causes it: {both}, an effect that is not in the catalogue (0.40), no effect (0.10)." in text
-    assert text.rstrip(".").endswith("To tell them apart: take beam-off frames")
+    assert text.rstrip(".").endswith("To distinguish them: take beam-off frames")
 
 
 def test_no_gap_says_how_sure_it_is_and_wrong_labels_come_before_everything():

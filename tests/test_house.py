@@ -30,17 +30,7 @@ BELOW = {
     "observers": {"acquisition", "materials", "spectra", "generator", "pod"},
     "calibration": {"acquisition", "materials", "spectra", "generator"},
     "checks": {"acquisition", "materials", "spectra", "generator", "calibration"},
-    "diagnosis": {
-        "acquisition",
-        "materials",
-        "spectra",
-        "generator",
-        "calibration",
-        "checks",
-        "segmentation",
-        "pod",
-        "reports",
-    },
+    "diagnosis": {"acquisition", "generator", "calibration", "checks", "reports"},
 }
 SHIPPED = {
     "raytwin.data.calibration": "data/calibration",

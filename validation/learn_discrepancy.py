@@ -26,7 +26,7 @@ import second_simulator as plain
 from raytwin.acquisition import open_acquisition
 from raytwin.diagnosis.inference.curve_fits import CurveFit
 from raytwin.diagnosis.inference.discrepancy import LEVELS
-from raytwin.diagnosis.inference.inference import UNKNOWN, evidence_with_misfit
+from raytwin.diagnosis.inference.inference import UNKNOWN, Misfits
 from raytwin.diagnosis.inference.unknown import LOG_DENSITY
 from raytwin.diagnosis.judgement.judgement import Weighed, verdict_of, weigh_problem
 from raytwin.diagnosis.problem.assemble import problem_of
@@ -79,10 +79,10 @@ def told_by_law(weighed: Weighed, fit: CurveFit, *, another: bool = False) -> di
     """
     by_level = fit.at_any_strength if another else fit.by_level
     point = fit.at_level(LEVELS.levels[-1] if another else fit.level)
-    evidence, ratio = evidence_with_misfit(
-        weighed.observed, [point], families=weighed.problem.families, another=another
-    )
-    return {"by_level": list(by_level), "with_misfit": evidence, "ratio": ratio}
+    misfits = Misfits(weighed.observed, weighed.problem.families)
+    evidence, found = misfits.in_presence_of([point])
+    evidence += misfits.prior([point], another=another)
+    return {"by_level": list(by_level), "with_misfit": evidence, "ratio": misfits.ratio([point], found)}
 
 
 def told(hypotheses) -> dict:

@@ -218,7 +218,7 @@ def length(factors: NDArray[np.float64], blocks: NDArray[np.intp], moved: NDArra
 
 def table_text(found: Distinguishability) -> str:
     """The matrix as text, one row an effect: onset, detection, and the effects from which it is not clearly apart."""
-    title = f"not told apart there (separation below {CLEAR:g})"
+    title = f"not distinguished there (separation below {CLEAR:g})"
     lines = [f"{'effect':<19}{'since':<12}{'seen from':>10}{'strength':>10} {'unit':<5}{'from none':>11}   {title}"]
     for row, effect in enumerate(found.effects):
         unit = EFFECTS[effect].strength.unit if effect in EFFECTS else ""

@@ -109,7 +109,7 @@ def _weighed(
     count = max(len(singles), of_catalogue, 1)
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
     looked_at = _WITH_MISFIT if misfits else 0
-    left = _Misfits(observed, families)
+    left = Misfits(observed, families)
     none = left.none
     nothing = left.no_effect(misfits)
     weighed = [(nothing, math.log(priors.none))]
@@ -189,23 +189,7 @@ def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis
     return tuple(sorted(every, key=lambda item: (-item.probability, -item.log_evidence)))
 
 
-def evidence_with_misfit(
-    observed: Observed,
-    points: Sequence[Point],
-    *,
-    families: Families,
-    another: bool = False,
-) -> tuple[float, float]:
-    """Log evidence over none of effects at their points with a misfit beside them of any length, and its length over theirs.
-
-    another: they are only like these.
-    """
-    misfits = _Misfits(observed, families)
-    evidence, found = misfits.in_presence_of(points)
-    return evidence + misfits.prior(points, another=another), misfits.ratio(points, found)
-
-
-class _Misfits:
+class Misfits:
     """What laws leave beside effects, in families of probes."""
 
     def __init__(self, observed: Observed, families: Families) -> None:

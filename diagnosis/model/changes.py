@@ -13,10 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...calibration.priors import ATTENUATION_SCALE, DEPARTURES, PRIORS, UNDECLARED_SCINTILLATOR, spread_of
+from ...calibration.priors import (
+    ATTENUATION_SCALE,
+    DEPARTURES,
+    PRIORS,
+    UNDECLARED_SCINTILLATOR,
+    UNDECLARED_THRESHOLD,
+    spread_of,
+)
 from ...generator.effects import EFFECTS, AppliedEffect, Effect
 from ...generator.effects.effect import Displacement, Parameter, Placement
 from ...generator.line.series_request import SeriesRequest
+from ...generator.line.spectral_signal import THRESHOLD
 from ...generator.line.twin import Estimate, SpectralPosterior, SpreadEstimate, Twin
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS
 from ..session.binning import per_bin
@@ -344,8 +352,10 @@ def spectral_sds(posterior: SpectralPosterior) -> NDArray[np.float64]:
     result = []
     for name in posterior.names:
         sd = spread_of(PRIORS.get(name, ATTENUATION_SCALE))
-        if name == "log_scintillator_thickness" and "not declared" in str(posterior.prior.get(name, "")):
+        if posterior.prior.get(name) == str(UNDECLARED_SCINTILLATOR):
             sd = UNDECLARED_SCINTILLATOR.sd
+        if name == THRESHOLD:
+            sd = UNDECLARED_THRESHOLD.spread
         if name in ("log_output", "log_DN_per_keV"):
             # fixed by the level within percents; a wide prior would only leave the linear range
             sd = 0.03

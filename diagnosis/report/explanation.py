@@ -171,9 +171,9 @@ def verdict_text(diagnosis: Diagnosis) -> str:
         )
     if diagnosis.verdict == "ambiguous":
         named = ", ".join(f"{title} ({probability:.2f})" for title, probability in rivals(diagnosis))
-        text = f"{where} These data cannot tell apart what causes it: {named}. {figures}."
+        text = f"{where} These data cannot distinguish what causes it: {named}. {figures}."
         if diagnosis.next_measurement:
-            text += f" To tell them apart: {diagnosis.next_measurement['text']}."
+            text += f" To distinguish them: {diagnosis.next_measurement['text']}."
         return text
     named = "; ".join(
         f"{title_of(cause.effect)}, {strength_text(cause)}, probability {cause.probability:.2f}"

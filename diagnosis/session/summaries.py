@@ -35,7 +35,7 @@ class SeriesSummary:
     of BLOCK_PX; temporal_covariance_DN2 (2,): mean product of a pixel's deviations one and two frames apart;
     kurtosis_excess of differences, pooled over standardised pixels; frame_mean_DN (n,); distinct_codes,
     code_range: how many whole numbers occur between the 1st and 99th percentile, and how many there are from the first
-    to the last of them; saturated_share.
+    to the last of them.
     """
 
     frames: int
@@ -54,7 +54,6 @@ class SeriesSummary:
     frame_mean_DN: NDArray[np.float64]
     distinct_codes: int
     code_range: int
-    saturated_share: float
 
     def without_lines(self, rows_DN2: float, columns_DN2: float) -> "SeriesSummary":
         """What the frames would say without offsets of rows and columns of these variances (DN^2), new in every frame.
@@ -76,7 +75,10 @@ class SeriesSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FirstLook:
-    """What says which pixels and series can be used; fields as those of `SeriesSummary`; copies: frames that equal an earlier one."""
+    """What says which pixels and series can be used.
+
+    Fields: as those of `SeriesSummary`; copies: frames that equal an earlier one; saturated_share: of the numbers of good pixels.
+    """
 
     frames: int
     copies: int
@@ -174,7 +176,7 @@ def look_at_series(
     name: str = "frames",
     saturation_DN: float | None = None,
 ) -> FirstLook:
-    """Mean, variances and saturation of a series; arguments and errors as those of `summarise_series`."""
+    """Mean, variances and saturation of a series; saturation_DN: full scale, where known; else as `summarise_series`."""
     found, scan = _Variances(good.shape), CopyScan()
     saturated = 0
 
@@ -204,7 +206,6 @@ def summarise_series(
     labels: NDArray[np.integer[Any]],
     pattern: NDArray[np.floating[Any]] | None = None,
     name: str = "frames",
-    saturation_DN: float | None = None,
 ) -> SeriesSummary:
     """Statistics of a series, from pieces (m, row, column) in time order, DN.
 
@@ -215,7 +216,6 @@ def summarise_series(
         pattern: how one unit of the common factor looks (row, column), mean 1 over good pixels: the signal's shape with
             the beam on, None (1 everywhere) without.
         name: for errors.
-        saturation_DN: full scale, where known.
 
     Raises:
         InputError: no frames, frames of another shape than `good`, or values that are not finite.
@@ -239,23 +239,15 @@ def summarise_series(
     temporal = np.zeros(2)
     temporal_pairs = np.zeros(2)
     frame_means = []
-    codes: NDArray[np.int64] | None = np.zeros(0, dtype=np.int64)
-    saturated = 0
     blocks = in_blocks(good).sum(axis=(1, 3), dtype=np.float32)
     row_count = np.maximum(use.sum(axis=1), 1.0)
     column_count = np.maximum(use.sum(axis=0), 1.0)
-    code_parts: list[NDArray[Any]] = []
+    code_parts: list[NDArray[Any]] = []  # whole numbers alone: others have no codes
     coded = 0
     for raw, x, cleaned, d in _pieces(pieces, good, pattern, name):
-        if codes is not None:
-            if raw.dtype.kind in "ui":
-                if coded < CODES_FRAMES:
-                    code_parts.append(raw[: CODES_FRAMES - coded][:, good].ravel())
-                    coded += min(len(raw), CODES_FRAMES - coded)
-            else:
-                codes = None
-        if saturation_DN is not None:
-            saturated += int(np.count_nonzero(raw[:, good] >= saturation_DN))
+        if raw.dtype.kind in "ui" and coded < CODES_FRAMES:
+            code_parts.append(raw[: CODES_FRAMES - coded][:, good].ravel())
+            coded += min(len(raw), CODES_FRAMES - coded)
         means = np.tensordot(x, use, axes=2).astype(np.float64) / n_good
         frame_means.append(means)
         d2 = variances.add(x, cleaned, d)
@@ -289,7 +281,7 @@ def summarise_series(
     with np.errstate(invalid="ignore", divide="ignore"):
         covariance = label_covariance / max(n_pairs, 1) / pixel_pairs
     distinct = span = 0
-    if codes is not None and code_parts:
+    if code_parts:
         distinct, span = _codes(np.concatenate(code_parts))
     one = max(n_pairs, 1)
     return SeriesSummary(
@@ -309,7 +301,6 @@ def summarise_series(
         frame_mean_DN=np.concatenate(frame_means),
         distinct_codes=distinct,
         code_range=span,
-        saturated_share=saturated / (frames * n_good),
     )
 
 

@@ -22,8 +22,7 @@ class SeenSeries:
     """Series that can be compared, in order of time, and what a first pass over their frames shows, by name.
 
     Fields: kept; expected: by the base twin; looks; readable (row, column): pixels whose noise is not cut off at 0; labels (row,
-    column): noise label of each pixel, -1: none; label_names;
-    saturation_DN: end of the ADC's range, None: unknown; skipped: what is said of series that are left out.
+    column): noise label of each pixel, -1: none; label_names; skipped: what is said of series that are left out.
     """
 
     kept: tuple[SessionSeries, ...]
@@ -32,7 +31,6 @@ class SeenSeries:
     readable: dict[str, NDArray[np.bool_]]
     labels: dict[str, NDArray[np.int64]]
     label_names: dict[str, tuple[str, ...]]
-    saturation_DN: float | None
     skipped: tuple[str, ...]
 
 
@@ -140,7 +138,6 @@ def look_at_all(
         readable=readable,
         labels=labels,
         label_names=label_names,
-        saturation_DN=saturation_DN,
         skipped=(*skipped, *left_out.values()),
     )
 
@@ -159,7 +156,6 @@ def summarise_all(
             labels=seen.labels[item.name],
             pattern=_pattern(item, signal_map(seen.expected[item.name], good.shape), good),
             name=f"series {item.name}",
-            saturation_DN=seen.saturation_DN,
         )
     return summaries
 

@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plan",
         action="store_true",
-        help="say which effects these series could tell apart, whatever the frames show, and write no diagnosis",
+        help="say which effects these series could distinguish, whatever the frames show, and write no diagnosis",
     )
     task = parser.add_argument_group(
         "POD before and after",

@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--registration",
         metavar="ROWS,COLUMNS|estimate",
-        help="shift in pixels of the references' high-kV image against the low one, taken off",
+        help="shift in pixels of the references' high-kV image against the low one; it is undone",
     )
     parser.add_argument("--reference-low", metavar="SETTING", help="setting of the references where they do not say")
     parser.add_argument("--reference-high", metavar="SETTING", help="the same at the high kV")

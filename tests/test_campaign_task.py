@@ -12,9 +12,8 @@ from raytwin.acquisition.pairs import PairCorrector, object_pairs
 from raytwin.campaign import object_material
 from raytwin.campaign import task as task_module
 from raytwin.campaign.task import TaskInput, TaskPlan, check_task, run_task, scene_of
+from raytwin.campaign.task_page import pod_charts, task_text
 from raytwin.cli import main
-from raytwin.diagnosis.report.explanation import task_text
-from raytwin.diagnosis.report.figures import task_charts
 from raytwin.errors import InputError
 from raytwin.generator.datasets.known_scenes import KnownScenes
 from raytwin.generator.effects import AppliedEffect
@@ -212,7 +211,7 @@ def test_task_tries_twins_that_differ_by_the_effect_and_measured_images_on_the_s
     # an answer is JSON, and it can be said and drawn
     assert json.loads(json.dumps(found)) == found
     assert "measured" in task_text(found)
-    drawn = task_charts(found)
+    drawn = pod_charts(found)
     assert [chart.name for chart in drawn] == ["pod_expected", "pod_tried"]
     assert all("twin before" in chart.numbers_csv() for chart in drawn)
     paths = [tmp_path / "task" / f"{name}_test.h5" for name in ("before", "after")]

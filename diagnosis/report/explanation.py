@@ -1,8 +1,7 @@
 """The diagnosis in plain words: one paragraph that can be read once."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from ...checks.findings import FindingCode
 from ...generator.effects import EFFECTS
@@ -217,32 +216,3 @@ def rest_text(diagnosis: Diagnosis) -> str:
     left = leading[0].left if leading else ()
     place = f", most in the {_place_text(left[0])}" if left else ""
     return f" The law leaves a misfit that is no noise{place}{told}."
-
-
-def task_text(task: Mapping[str, Any]) -> str:
-    """What the gap means for detection: a90 as the twin had it, as the improved twin has it, as measured."""
-    unit = f" {task['unit']}" if task["unit"] else ""
-
-    def told(name: str) -> str:
-        value, interval = task[name], task[f"{name}_95"]
-        if value is None:
-            return "none that the data support"
-        low, high = ("?" if end is None else f"{end:.3g}" for end in (interval["low"], interval["high"]))
-        return f"{value:.3g}{unit} ({low} to {high})"
-
-    what = "the size" if task["size"] == "size_mm" else "the contrast"
-    start = f"In detection, {what} found in nine of ten cases (a90)"
-    if not task["effects"]:
-        text = f"{start} is {told('a90_before')} by the twin; measured: {told('a90_real')}."
-    else:
-        text = f"{start} moves from {told('a90_before')} to {told('a90_after')}; measured: {told('a90_real')}."
-    for found in task.get("materials", ()):
-        low, high = (found["contrast_change_percent"][name] for name in ("low_kV", "high_kV"))
-        at_low, at_high = (f"{one['value']:+.2g} % ({one['low']:+.2g} to {one['high']:+.2g})" for one in (low, high))
-        text += (
-            f" The contrast of {found['material']} differs from the library's by {at_low} at the low voltage and by {at_high} at the"
-            " high one."
-        )
-    if task.get("materials"):
-        text += f" Images of the twin have it so; with the library's material a90 is {told('a90_library')}."
-    return text

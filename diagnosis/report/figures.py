@@ -1,7 +1,7 @@
 """Pictures of a diagnosis: gap maps, curves by axis, before and after, hypotheses."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
-from ...reports import AFTER, BEFORE, MEASURED, Band, Bars, Chart, Line, Picture, Points, Rule
+from ...reports import AFTER, BEFORE, Bars, Chart, Line, Picture, Points, Rule
 from ...reports.chart import SERIES_COLOURS, SHAPES, Shape, asinh_ticks, rows_px
 from ..inference.inference import UNKNOWN
 from ..judgement.answer import Diagnosis
@@ -282,52 +282,3 @@ def hypotheses_chart(diagnosis: Diagnosis) -> Chart:
         downwards=True,
         height_px=90 + max(rows_px(names), 68),
     )
-
-
-def task_charts(task: Mapping[str, Any]) -> list[Chart]:
-    """Share of objects detected against their size: the two twins' networks on their own images, and measured ones."""
-    real = "measured_on_measured" if task["real_networks"] == "measured" else "after_on_measured"
-    left: tuple[tuple[str, str, str, Shape], ...] = (
-        ("before_on_before", "twin before", BEFORE, "square"),
-        ("after_on_after", "twin after", AFTER, "circle"),
-        (real, "measured", MEASURED, "triangle"),
-    )
-    right: tuple[tuple[str, str, str, Shape], ...] = (
-        ("before_on_measured", "learnt from the twin before", BEFORE, "square"),
-        ("after_on_measured", "learnt from the twin after", AFTER, "circle"),
-        ("measured_on_measured", "learnt from measured images", MEASURED, "triangle"),
-    )
-    charts = []
-    for name, which, title in (
-        ("expected", left, "As expected, and as measured"),
-        ("tried", right, "Tried on measured images"),
-    ):
-        marks: list[Any] = [Rule(at=0.9)]
-        for key, label, colour, shape in which:
-            curve = task["curves"].get(key)
-            if curve is None:
-                continue
-            points, line = curve["points"], curve["line"]
-            if line is not None:
-                marks.append(Band(x=line["size"], low=line["low"], high=line["high"], colour=colour))
-                marks.append(Line(x=line["size"], y=line["pod"], colour=colour, label=label))
-            share = [one["hits"] / one["n"] for one in points]
-            told = [f"{label}: {one['hits']} of {one['n']}" for one in points]
-            without = label if line is not None else f"{label} (no curve)"
-            marks.append(
-                Points(
-                    x=[one["size"] for one in points], y=share, colour=colour, shape=shape, label=without, names=told
-                )
-            )
-        charts.append(
-            Chart(
-                name=f"pod_{name}",
-                title=title,
-                alt="Share of foreign objects detected against their size, with 95 % bands; dotted: 90 %.",
-                marks=marks,
-                x_label="longest side, mm" if task["size"] == "size_mm" else "contrast",
-                y_label="share detected",
-                y_ends=(-0.03, 1.03),
-            )
-        )
-    return charts

@@ -1,6 +1,7 @@
 """The diagnosis as one self-contained HTML page."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,10 @@ from .explanation import (
     rivals,
     strained_text,
     strength_text,
-    task_text,
     title_of,
     verdict_text,
 )
-from .figures import gap_maps, held_out_chart, hypotheses_chart, places_chart, task_charts, transmission_curves
+from .figures import gap_maps, held_out_chart, hypotheses_chart, places_chart, transmission_curves
 
 _MAPS = 4  # series whose maps are drawn
 _SINCE = {"calibration": "since the calibration"}
@@ -45,18 +45,42 @@ def residuals_after(diagnosis: Diagnosis) -> list[NDArray[np.float32]]:
     ]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Detection:
+    """What the gap means for detection: in words, a line each kind of networks and images, POD curves, warnings, the setting."""
+
+    text: str
+    rows: SortedTable
+    charts: Sequence[Figure]
+    warnings: Sequence[str]
+    setting: str
+
+
 def write_report(
-    diagnosis: Diagnosis, answer: Mapping[str, Any], path: Path, *, version: str, interactive: bool | None = None
+    diagnosis: Diagnosis,
+    answer: Mapping[str, Any],
+    path: Path,
+    *,
+    version: str,
+    detection: Detection | None = None,
+    interactive: bool | None = None,
 ) -> Path:
-    """Write the page; returns its path. interactive: figures that answer to the pointer; None: where Bokeh is installed."""
+    """Write the page; returns its path.
+
+    Args:
+        diagnosis, answer: the result, and its plain values.
+        path: of the page.
+        version: of raytwin.
+        detection: of the task that was asked, if one was.
+        interactive: figures that answer to the pointer; None: where Bokeh is installed.
+    """
     after = residuals_after(diagnosis)
-    task = answer.get("task")
     maps = gap_maps(diagnosis, after, count=_MAPS)
     first = 2 if diagnosis.added else 1  # of the series with most gap
     groups: dict[str, list[Figure]] = {
         "map": [*maps],
         "curve": [*transmission_curves(diagnosis, after)],
-        "task": [] if task is None else [*task_charts(task)],
+        "task": [] if detection is None else [*detection.charts],
     }
     figures: dict[str, Figure] = {
         "held_out": held_out_chart(diagnosis),
@@ -81,10 +105,7 @@ def write_report(
         maps=names["map"][first:],
         curves=names["curve"],
         steps=next_steps(diagnosis),
-        task=None if task is None else _task_rows(task),
-        task_text="" if task is None else task_text(task),
-        task_warnings=[] if task is None else task["warnings"],
-        task_setting="" if task is None else task["setting"],
+        detection=detection,
         task_figures=names["task"],
         causes=_causes(diagnosis),
         where=_where(answer),
@@ -274,32 +295,3 @@ def _where(answer: Mapping[str, Any]) -> SortedTable:
     ]
     header = ("axis", "series", "statistic", "location", "z")
     return SortedTable(header=header, rows=tuple(rows), words=frozenset({0, 1, 2, 3}))
-
-
-def _task_rows(task: Mapping[str, Any]) -> SortedTable:
-    """One line for each kind of networks and of images that they were tried on."""
-    names = {
-        "before": "twin before",
-        "after": "twin after",
-        "library": "twin after, objects of the library's material",
-        "measured": "measured images",
-    }
-
-    def shown(value: float | None) -> str:
-        return "none" if value is None else f"{value:.3g}"
-
-    rows = []
-    for name, curve in task["curves"].items():
-        networks, _, images = name.partition("_on_")
-        interval, alarms = curve["a90_95_interval"], curve["false_alarms"]
-        rows.append(
-            (
-                names[networks],
-                names[images],
-                f"{curve['n_hits']} of {curve['n']} ({curve['objects']} objects)",
-                f"{shown(curve['a90'])} ({shown(interval['low'])} to {shown(interval['high'])})",
-                "" if alarms is None else f"{alarms['false_alarms']} of {alarms['n']}",
-            )
-        )
-    header = ("networks learnt from", "tried on", "hits", "a90 (95 %)", "false alarms")
-    return SortedTable(header=header, rows=tuple(rows), words=frozenset({0, 1}))

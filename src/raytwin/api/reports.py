@@ -52,9 +52,13 @@ def report(
     from ..diagnosis.judgement.answer import Diagnosis
 
     if isinstance(result, Diagnosis):
+        from ..campaign.task_page import detection_of
         from ..diagnosis.report.report import write_report
 
-        return write_report(result, result.to_dict(), path, version=__version__, interactive=interactive)
+        detection = detection_of(result.task)
+        return write_report(
+            result, result.to_dict(), path, version=__version__, detection=detection, interactive=interactive
+        )
     return write_result_page(path, _page_of(result), version=__version__, interactive=interactive)
 
 

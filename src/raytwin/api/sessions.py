@@ -292,10 +292,11 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 
 def _write(found: "Diagnosis", folder: Path) -> None:
     from .. import __version__
+    from ..campaign.task_page import detection_of
     from ..diagnosis.report.report import write_report
 
     answer = found.to_dict()
-    write_report(found, answer, folder / "report.html", version=__version__)
+    write_report(found, answer, folder / "report.html", version=__version__, detection=detection_of(found.task))
     write_json(folder / "diagnosis.json", answer)
 
 

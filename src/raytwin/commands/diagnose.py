@@ -92,9 +92,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin diagnose`."""
     from ..api._progress import Bar
     from ..api.sessions import diagnose
+    from ..campaign.task_page import task_text
     from ..diagnosis.advice.plan import table_text
     from ..diagnosis.advice.plan_session import SessionPlan
-    from ..diagnosis.report.explanation import paragraph, task_text
+    from ..diagnosis.report.explanation import paragraph
 
     with Bar(only_on_terminal=True) as bar:
         found = diagnose(

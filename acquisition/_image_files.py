@@ -130,6 +130,7 @@ def iter_images(path: Path, *, raw: RawLayout | None = None) -> Iterator[NDArray
             str(path),
             received=f"a file {ending or 'without ending'}",
             expected="TIFF, PNG, FITS, DICOM, HIS, EDF or raw",
+            remedy="export it as TIFF; or name it .raw and describe it under [raw] in the sidecar",
         )
 
 

@@ -43,7 +43,12 @@ def read_sidecar(source: Path, sidecar: Path | None, *, known: Iterable[str], mi
     try:
         tables = tomllib.loads(read_utf8(path))
     except tomllib.TOMLDecodeError as error:
-        raise FileFormatError(str(path), received=f"text that is not TOML ({error})", expected="a TOML file") from None
+        raise FileFormatError(
+            str(path),
+            received=f"text that is not TOML ({error})",
+            expected="a TOML file",
+            remedy="write texts in quotes and numbers with a decimal point",
+        ) from None
     check_words(tables, known, where=path.name)
     return tables
 
@@ -155,7 +160,10 @@ def files_matching(folder: Path, patterns: str | list[str], *, where: str) -> li
         matches = sorted((path for path in folder.glob(pattern) if path.is_file()), key=natural_key)
         if not matches:
             raise InputError(
-                where, received=f"no file that matches {pattern!r}", expected=f"images below {folder.name}/"
+                where,
+                received=f"no file that matches {pattern!r}",
+                expected=f"images below {folder.name}/",
+                remedy="check folder and ending: upper and lower case count",
             )
         found += [path for path in matches if path not in found]
     return found

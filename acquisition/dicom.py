@@ -100,7 +100,12 @@ def import_dicom(
 
 def _files(root: Path) -> list[Path]:
     if not root.exists():
-        raise InputError(str(root), received="no such file or folder", expected="DICOM files, or a folder of them")
+        raise InputError(
+            str(root),
+            received="no such file or folder",
+            expected="DICOM files, or a folder of them",
+            remedy="check the path",
+        )
     places = [root] if root.is_file() else sorted((path for path in root.rglob("*") if path.is_file()), key=natural_key)
     found = [path for path in places if path.suffix.lower() in DICOM_ENDINGS or is_dicom(path)]
     if not found:
@@ -139,7 +144,12 @@ def _groups(root: Path, files: list[Path]) -> tuple[list[_Group], list[Skipped]]
         group.files.append((path, header))
     if not groups:
         told = files[0].name + (f" and {len(files) - 1} more" if len(files) > 1 else "")
-        raise InputError(str(root), received=f"DICOM files without images ({told})", expected="images")
+        raise InputError(
+            str(root),
+            received=f"DICOM files without images ({told})",
+            expected="images",
+            remedy="export the images themselves, not reports or a directory of them",
+        )
     for group in groups:
         group.files.sort(key=lambda one: (one[1].number is None, one[1].number or 0, natural_key(one[0])))
     return groups, skipped

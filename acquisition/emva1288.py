@@ -192,7 +192,12 @@ def _image_path(folder: Path, rest: list[str], *, where: str) -> Path:
         # Sets are made on systems that do not tell upper from lower case.
         path = _ignoring_case(folder, relative) or path
     if not path.is_file():
-        raise FileFormatError(where, received=f"image {relative}", expected="a file that exists below the list")
+        raise FileFormatError(
+            where,
+            received=f"image {relative}",
+            expected="a file that exists below the list",
+            remedy="copy the images beside the list, under the names that it gives",
+        )
     return path
 
 

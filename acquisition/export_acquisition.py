@@ -210,7 +210,12 @@ def _write_nxtomo(acquisition: AcquisitionFile, place: Path, count: Count) -> tu
     shapes = {series.shape for series in taken}
     if len(shapes) > 1:
         told = " and ".join(f"{row} x {column}" for row, column in sorted(shapes))
-        raise InputError(acquisition.path, received=f"frames of {told} pixels", expected="frames of one shape")
+        raise InputError(
+            acquisition.path,
+            received=f"frames of {told} pixels",
+            expected="frames of one shape",
+            remedy="write the series of each shape to an acquisition of their own",
+        )
     shape = taken[0].shape
     total = sum(series.n_frames for series in taken)
     whole = all(series.dtype == np.uint16 for series in taken)

@@ -115,6 +115,7 @@ class ObjectPair:
                 f"series {self.low.name} and {self.high.name}",
                 received="no exposure time",
                 expected="kV and exposure of both",
+                remedy="state exposure_ms of both series",
             )
         return self.low.setting, self.high.setting
 
@@ -407,6 +408,7 @@ def dataset_from_acquisition(
             acquisition.path,
             received=f"{len(chosen)} pairs and no usable scene ({skipped[-1]})",
             expected="scenes with foreign_object_mask",
+            remedy="give each scene a mask; an empty one says that it holds no object",
         )
     raw = all(not (pair.low.corrected or pair.high.corrected) for pair, _ in usable)
     if with_counts and not raw:

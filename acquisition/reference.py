@@ -190,7 +190,10 @@ def _from_images(folder: Path, out: str | os.PathLike[str], tables: Mapping[str,
     )
     if settings[0].kV >= settings[1].kV:
         raise InputError(
-            where, received=f"{settings[0].kV:g} kV and {settings[1].kV:g} kV", expected="the lower tube voltage as low"
+            where,
+            received=f"{settings[0].kV:g} kV and {settings[1].kV:g} kV",
+            expected="the lower tube voltage as low",
+            remedy="exchange low and high, or give another kV",
         )
     patterns = {
         word: starred(folder, text_of(table, word, where=where) or "", where=f"{where}, {word}")
@@ -213,6 +216,7 @@ def _from_images(folder: Path, out: str | os.PathLike[str], tables: Mapping[str,
             str(folder),
             received=f"no image pair with mask ({skipped[0].what}: {skipped[0].reason})" if skipped else "no images",
             expected="files that match low, high and foreign_object_mask",
+            remedy='check the patterns in [pairs]; without_mask = "clean" takes images without mask as free of objects',
         )
     known_names = patterns["low"].keys() | patterns["high"].keys()
     skipped += [Skipped(what=f"row {name}", reason="no image of that name") for name in rows if name not in known_names]

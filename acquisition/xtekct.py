@@ -117,7 +117,12 @@ def _settings_file(source: Path) -> Path:
     if source.is_file():
         return source
     if not source.is_dir():
-        raise InputError(str(source), received="no such file or folder", expected="an .xtekct file, or its folder")
+        raise InputError(
+            str(source),
+            received="no such file or folder",
+            expected="an .xtekct file, or its folder",
+            remedy="check the path",
+        )
     found = sorted(path for path in source.iterdir() if path.suffix.lower() == ".xtekct")
     if len(found) != 1:
         raise InputError(

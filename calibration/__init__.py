@@ -54,7 +54,6 @@ if TYPE_CHECKING:
     from .frame_sums import (
         FrameSums,
         effective_frames,
-        merge_frame_sums,
         sum_frames,
     )
     from .next_measurement import (
@@ -115,7 +114,6 @@ _LAZY = {
     "fit_spectrum": "spectral_fit",
     "fit_spread": "spread_fit",
     "geometry_factor": "spectral_fit",
-    "merge_frame_sums": "frame_sums",
     "rank_measurements": "next_measurement",
     "sum_frames": "frame_sums",
     "validate_twin": "validate",
@@ -144,7 +142,6 @@ __all__ = [
     "fit_spectrum",
     "fit_spread",
     "geometry_factor",
-    "merge_frame_sums",
     "rank_measurements",
     "repeated_frame_indices",
     "same_scene",

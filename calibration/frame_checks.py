@@ -54,8 +54,7 @@ class SceneCheck:
 
     Fields: same (None: cannot be told); change (None where the scene is the same); frame (index of the first frame that
     differs, None where it is the same); changed_share (of the field); level_change and shape_change (largest, relative to
-    the signal; rms of the smooth part); growth (variance of block means at twice the block's side, relative to that of
-    white noise; noise has 1 to 2); block_px; changed (block rows, block columns): blocks that differ.
+    the signal; rms of the smooth part); block_px (side of a block); changed (block rows, block columns): blocks that differ.
     """
 
     same: bool | None
@@ -64,7 +63,6 @@ class SceneCheck:
     changed_share: float
     level_change: float
     shape_change: float
-    growth: float
     block_px: int
     changed: NDArray[np.bool_]
 
@@ -231,7 +229,6 @@ def _cannot_tell(block: int, shape: tuple[int, ...]) -> SceneCheck:
         changed_share=0.0,
         level_change=0.0,
         shape_change=0.0,
-        growth=1.0,
         block_px=block,
         changed=np.zeros(shape, dtype=bool),
     )
@@ -369,7 +366,7 @@ def _judged(
     for down in (0, 1):
         for right in (0, 1):
             changed[down : down + places.shape[0], right : right + places.shape[1]] |= places
-    growth, grows = _growth(left, local, noise, pattern_DN, consecutive, block)
+    grows = _grows(left, local, noise, pattern_DN, consecutive, block)
     level = max((item.level for item in changes), key=abs, default=0.0)
     smooth = max(item.shape for item in changes)
     lines_DN = np.array([item.lines_DN for item in changes])
@@ -408,7 +405,6 @@ def _judged(
         changed_share=float(changed.mean()),
         level_change=float(level),
         shape_change=float(smooth),
-        growth=growth,
         block_px=block,
         changed=changed,
     )
@@ -453,15 +449,15 @@ def _variance_law(mixed: NDArray[np.float64], local: NDArray[np.float64]) -> NDA
     return np.asarray(np.maximum(solution[0] + solution[1] * local, floor))
 
 
-def _growth(
+def _grows(
     left: NDArray[np.float64],
     local: NDArray[np.float64],
     noise: NDArray[np.float64],
     pattern_DN: NDArray[np.float64],
     consecutive: int,
     block: int,
-) -> tuple[float, bool]:
-    """Variance of block means at twice the side over a quarter of that at the side; whether noise cannot have so much.
+) -> bool:
+    """Whether block means at twice the side vary more than noise can, over a quarter of their variance at the side.
 
     Noise has what a spread of `WIDEST_SPREAD_PX` gives it at most, and a pattern that changes does not average out; the
     sampling error of both robust variances is added at `FALSE_ALARM`.
@@ -474,22 +470,21 @@ def _growth(
     """
     rows, columns = left.shape[1] // 2, left.shape[2] // 2
     if rows < 2 or columns < 2:
-        return 1.0, False
+        return False
     # places of the larger blocks: every second of the smaller ones' places, in the middle of four
     middle = (slice(1, 2 * rows - 1, 2), slice(1, 2 * columns - 1, 2))
     coarse = _mixed(block_means(left, 2))
     noise_here, pattern_here = noise[middle], pattern_DN[middle]
     most = growth_of_noise(block, WIDEST_SPREAD_PX) * noise_here / 4.0 + 4.0 * pattern_here**2
-    result, grows = 0.0, False
+    grows = False
     for part in (slice(0, consecutive), slice(consecutive, None)):
         if not coarse[part].size:
             continue
-        result = max(result, 4.0 * _robust_variance(coarse[part] / np.sqrt(noise_here)))
         # the efficiency of a median of squares is 0.37, and overlapping differences count about half
         sd = math.sqrt(2.0 / 0.37 * 2.0 * (1.0 / coarse[part].size + 1.0 / (local.size * consecutive)))
         limit = math.exp(_two_sided_limit(FALSE_ALARM) * sd)
         grows = grows or _robust_variance(coarse[part] / np.sqrt(most)) > limit
-    return result, grows
+    return grows
 
 
 def growth_of_noise(side: int, spread_px: float) -> float:

@@ -1,8 +1,4 @@
-"""Sums over the frames of one series: all that photon transfer needs, from one pass in constant memory.
-
-The sums of two parts of a series, or of two sessions, add up (`merge_frame_sums`); the frame pair across the seam of
-two parts is then missing, nothing else.
-"""
+"""Sums over the frames of one series: all that photon transfer needs, from one pass in constant memory."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -151,32 +147,4 @@ def sum_frames(pieces: Iterable[NDArray[Any]], *, name: str = "frames") -> Frame
         maximum_DN=maximum_DN,
         maximum_count=maximum_count,
         integer=integer,
-    )
-
-
-def merge_frame_sums(first: FrameSums, second: FrameSums) -> FrameSums:
-    """The sums over both parts; the pair across their seam is left out.
-
-    Raises:
-        InputError: the parts have different frame shapes.
-    """
-    if first.reference.shape != second.reference.shape:
-        raise InputError(
-            "frame sums",
-            received=f"{first.reference.shape} and {second.reference.shape}",
-            expected="parts with frames of one shape",
-        )
-    shift = second.reference - first.reference
-    highest = max(first.maximum_DN, second.maximum_DN)
-    return FrameSums(
-        frames=first.frames + second.frames,
-        pairs=first.pairs + second.pairs,
-        reference=first.reference,
-        deviation_sum=first.deviation_sum + second.deviation_sum + second.frames * shift,
-        square_sum=first.square_sum + second.square_sum + 2 * shift * second.deviation_sum + second.frames * shift**2,
-        pair_square_sum=first.pair_square_sum + second.pair_square_sum,
-        frame_mean_DN=np.concatenate([first.frame_mean_DN, second.frame_mean_DN]),
-        maximum_DN=highest,
-        maximum_count=sum(part.maximum_count for part in (first, second) if part.maximum_DN == highest),
-        integer=first.integer and second.integer,
     )

@@ -117,11 +117,6 @@ class SpreadFit:
         """Width of the Gaussian core, px."""
         return self.spread.sigma_px
 
-    @property
-    def sigma_sd_px(self) -> float:
-        """Standard deviation of the core's width, px."""
-        return self.spread_sd["sigma_px"]
-
 
 @dataclass(slots=True)
 class _Candidate:

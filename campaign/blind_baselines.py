@@ -228,12 +228,11 @@ def fit_signatures(examples: Sequence[Example], effects: Sequence[str]) -> Signa
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Logistic:
-    """Multinomial logistic regression. Fields: scale; classes; weights (class, feature + 1, the last the offset); ridge."""
+    """Multinomial logistic regression. Fields: scale; classes; weights (class, feature + 1, the last the offset)."""
 
     scale: FeatureScale
     classes: tuple[str, ...]
     weights: NDArray[np.float64]
-    ridge: float
 
     def probability(self, features: Mapping[str, float]) -> dict[str, float]:
         """Probabilities of classes."""
@@ -280,7 +279,7 @@ def _logistic(examples: Sequence[Example], classes: Sequence[str], ridge: float)
         return value, slope.ravel()
 
     solved = minimize(loss, np.zeros(shape[0] * shape[1]), jac=True, method="L-BFGS-B", options={"maxiter": 200})
-    return Logistic(scale=scale, classes=tuple(classes), weights=solved.x.reshape(shape), ridge=ridge)
+    return Logistic(scale=scale, classes=tuple(classes), weights=solved.x.reshape(shape))
 
 
 def _log_loss(answers: Sequence[Mapping[str, float]], examples: Sequence[Example]) -> float:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..generator.line.twin import Z95
 from ..lab.cases import SETS
 from ..lab.effects import EFFECTS as LAB_EFFECTS
 from .blind_separation import NO_EFFECT, Separation
@@ -210,7 +211,7 @@ def _triple(value: Mapping[str, float] | None) -> tuple[float, float, float] | N
     return value["value"], value["low"], value["high"]
 
 
-def wilson_interval(hits: int, n: int, *, z: float = 1.959964) -> tuple[float, float]:
+def wilson_interval(hits: int, n: int, *, z: float = Z95) -> tuple[float, float]:
     """Wilson's score interval of a proportion.
 
     Source: Wilson, J. Am. Stat. Assoc. 22 (1927) 209; Brown, Cai & DasGupta, Stat. Sci. 16 (2001) 101.
@@ -318,7 +319,7 @@ def auroc(positive: NDArray[np.float64], negative: NDArray[np.float64]) -> dict[
     variance = 0.0
     if m > 1 and n > 1:
         variance = float(win.mean(axis=1).var(ddof=1)) / m + float(win.mean(axis=0).var(ddof=1)) / n
-    half = 1.959964 * math.sqrt(variance)
+    half = Z95 * math.sqrt(variance)
     return {
         "value": value,
         "low": max(value - half, 0.0),

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ..generator.line.twin import Z95
 from ..reports import AFTER, BEFORE, QUIET, Chart, Figure, Line, Points, Rule
 from ..reports.chart import Shape
 from ._ticks import few_ticks
@@ -162,7 +163,7 @@ def charts_of_both_sizes(row: Mapping[str, Any], answer: Mapping[str, Any]) -> l
 
 def left_out_chart(rows: Sequence[Mapping[str, Any]]) -> Chart:
     """a90 of networks against what an observer calibrated on the other settings expects."""
-    errors = [math.exp(1.96 * row["log_sd"]) for row in rows]
+    errors = [math.exp(Z95 * row["log_sd"]) for row in rows]
     predicted, measured = ([row[name] for row in rows] for name in ("predicted", "measured"))
     low = [value / error for value, error in zip(measured, errors, strict=True)]
     high = [value * error for value, error in zip(measured, errors, strict=True)]

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import only_one
+from ..generator.line.twin import Z95
 from .chain import Chain, Run, Tell, claim_folder
 from .demo_gap import GapPlan, run_gap
 from .lab_line import LabLine, measure_line, write_generated, write_measured
@@ -329,7 +330,7 @@ def gap_summary(validation: dict[str, Any]) -> dict[str, Any]:
     for row in validation["rows"]:
         for key, axis in (("mean_DN", "level"), ("sd_DN", "noise")):
             estimate = row[key]
-            sd = (estimate["high"] - estimate["low"]) / (2 * 1.959964)
+            sd = (estimate["high"] - estimate["low"]) / (2 * Z95)
             z = (row[f"measured_{key}"] - estimate["value"]) / sd if sd > 0 else 0.0
             rows.append({"axis": axis, "series": row["series"], "statistic": key, "z": z, "location": row["setting"]})
     rows.sort(key=lambda row: -abs(row["z"]))

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import open_acquisition
+from ..diagnosis.inference.inference import title_of
 from ..diagnosis.problem.assemble import problem_of
-from ..diagnosis.report.explanation import title_of
 from ..diagnosis.session.preparation import prepare_session
 from ..generator.line.twin import Twin
 from ..generator.twins.twin_io import read_twin

@@ -15,6 +15,7 @@ from scipy.optimize import minimize_scalar
 
 from ..diagnosis.model.changes import ATTENUATION_SD
 from ..errors import InputError
+from ..generator.line.twin import Z95
 
 if TYPE_CHECKING:
     from ..generator.datasets.known_scenes import KnownScene, KnownScenes
@@ -24,7 +25,6 @@ _PRIOR_SD = 0.3  # of a and b: bones are tabulated from 1.18 to 1.92 g/cm3 (ICRU
 _STEP = 0.1  # of a and b, for slopes: contrast is nearly straight in them
 _TURNS = 3  # of Gauss and Newton: the second changes contrasts of bones by 1e-3 of the first
 _WIDEST = 0.5  # scatter of contrasts from object to object; a choice: beyond it one of twenty is off by a factor of two
-_Z95 = 1.959964
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +61,7 @@ class ObjectMaterial:
         """Plain values for JSON."""
         sd = np.sqrt(np.diag(self.covariance))
         interval = {
-            name: {"value": value, "low": value - _Z95 * float(error), "high": value + _Z95 * float(error)}
+            name: {"value": value, "low": value - Z95 * float(error), "high": value + Z95 * float(error)}
             for name, value, error in (("material", self.a, sd[0]), ("product", self.b, sd[1]))
         }
         low, high = (dict(zip(("value", "low", "high"), found, strict=True)) for found in self.contrast_percent)
@@ -233,7 +233,7 @@ def _fit(
     for channel in range(2):
         value = 100.0 * float(mean_slope[channel] @ (at - [1.0, 0.0])) / float(mean[channel])
         error = 100.0 * math.sqrt(float(mean_slope[channel] @ covariance @ mean_slope[channel])) / float(mean[channel])
-        percents.append((value, value - _Z95 * error, value + _Z95 * error))
+        percents.append((value, value - Z95 * error, value + Z95 * error))
     return replace(
         own,
         objects=int(np.count_nonzero(usable)),

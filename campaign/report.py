@@ -8,7 +8,7 @@ from ..generator.line.twin import Twin
 from ..generator.twins.twin_io import read_twin
 from ..reports import write_page
 from .demo import read_hits
-from .demo_gap import WithheldFrame, answer_text, withheld_frames, withheld_rows, withheld_text
+from .demo_gap import answer_text, withheld_frames, withheld_rows, withheld_text
 from .figures import demo_figures
 
 _DASH = "–"
@@ -35,7 +35,7 @@ def write_report(result: Mapping[str, Any], directory: Path, *, version: str) ->
         table=[_table_row(row) for row in result["a90_table"]],
         pod_notes=_pod_notes(result["a90_table"]),
         missing=missing_a90(result["a90_table"], hits),
-        key_figures=_key_figures(result, withheld),
+        key_figures=_key_figures(result),
         gap_answer=answer_text(result["gap"]),
         withheld_text=withheld_text(withheld),
         withheld_rows=withheld_rows(withheld),
@@ -138,7 +138,7 @@ def _needed(looks: Sequence[Mapping[str, str]]) -> str:
     )
 
 
-def _key_figures(result: Mapping[str, Any], withheld: Sequence[WithheldFrame]) -> list[dict[str, str]]:
+def _key_figures(result: Mapping[str, Any]) -> list[dict[str, str]]:
     """The page's answers at a glance: figure and what it is."""
     error = result["validation"]["median_abs_error_percent"]
     figures = [

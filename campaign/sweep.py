@@ -10,7 +10,6 @@ was stopped goes on where it was, a setting that is added costs that setting, an
 """
 
 import csv
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import FitError, InputError, RaytwinError
-from ..files import only_one, whole_file
+from ..files import only_one, whole_file, write_json
 from ..generator.twins.twin_io import read_twin
 from ..observers import write_efficiency
 from ._plain import digest, plain, read_object
@@ -175,7 +174,7 @@ def run_sweep(
             outlook, label = outlook_of[text]
             row = _row(outlook, label, tasks[text], error)
             if not error:
-                _write_json(Path(tasks[text]["folder"]) / "row.json", row)
+                write_json(Path(tasks[text]["folder"]) / "row.json", row)
             rows[text] = row
             return row
 
@@ -199,7 +198,7 @@ def run_sweep(
             if screened.screen.efficiency is not None:
                 write_efficiency(directory / "observer.json", screened.screen.efficiency)
         answer = _answer(campaign, directory, list(rows.values()), basis, tasks, screened, progress)
-        _write_json(directory / "sweep.json", answer)
+        write_json(directory / "sweep.json", answer)
         write_table(directory / "sweep.csv", answer["rows"])
     return answer
 
@@ -547,7 +546,7 @@ def _ratio_to_best(
         return dict(held["ratio"])
     tell(f"comparing {Path(other['folder']).name} with the best")
     ratio = compare_tables(Path(best["folder"]) / "hits.csv", Path(other["folder"]) / "hits.csv", curve)
-    _write_json(kept, {"key": key, "ratio": ratio})
+    write_json(kept, {"key": key, "ratio": ratio})
     return ratio
 
 
@@ -600,7 +599,7 @@ def _claim(directory: Path) -> None:
             expected="a new or empty folder, or that of a sweep begun before",
         )
     directory.mkdir(parents=True, exist_ok=True)
-    _write_json(marker, {"format": "raytwin-sweep", "version": 1})
+    write_json(marker, {"format": "raytwin-sweep", "version": 1})
 
 
 def _answer_of_another(directory: Path, campaign: Campaign, basis: Mapping[str, Any]) -> str:
@@ -619,8 +618,3 @@ def marker_of(directory: Path) -> Path:
     """A file that is there once the folder is a sweep's: what workers on other machines must see."""
     _claim(directory)
     return (directory / _MARKER).resolve()
-
-
-def _write_json(path: Path, value: Mapping[str, Any]) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(plain(value), indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Where the tasks of a sweep are done: in this process, in processes of their own, or on a Dask cluster.
+"""Where the tasks of a sweep are done: in processes of their own, or on a Dask cluster.
 
 A task that fails is tried once more; one that fails twice is told as failed and does not stop the others. Tasks decide their own
 randomness and threads, so that what they write does not depend on where, in which order or beside what they run.
@@ -28,21 +28,6 @@ class Runner(Protocol):
     def run(self, tasks: Sequence[Task], done: Done) -> None: ...
 
     def close(self) -> None: ...
-
-
-class Here:
-    """In this process, one after the other."""
-
-    def __init__(self, tell: Callable[[str], None] = lambda line: None) -> None:
-        self._tell = tell
-
-    def run(self, tasks: Sequence[Task], done: Done) -> None:
-        """Do all tasks."""
-        for task in tasks:
-            done(task, _tried(lambda task=task: run_task(task, tell=self._tell)))  # type: ignore[misc]
-
-    def close(self) -> None:
-        """Nothing to close."""
 
 
 class Processes:

@@ -22,6 +22,7 @@ import numpy as np
 
 from ..acquisition.setting import Setting, setting_from_text
 from ..errors import FitError, InputError
+from ..generator.line.twin import Z95
 from ..generator.twins.twin_io import read_twin
 from .sweep_choice import paces, takes_part
 from .sweep_file import Campaign, Pair, Screening
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from ..observers import Efficiency, ForeignObjects, Observer, ProductTexture
 
 SMALLEST_CHANCE = 0.05
-_Z_TWO_SIDED = 1.959964
 _WORTH_CALIBRATING = 0.7  # of the largest object: networks whose a90 is near it have none as often as not
 _UNDECIDED = "undecided"
 
@@ -47,7 +47,7 @@ class Expected:
     @property
     def log_sd(self) -> float:
         """Standard deviation of ln a90 that the interval stands for."""
-        return math.log(self.high / self.low) / (2.0 * _Z_TWO_SIDED)
+        return math.log(self.high / self.low) / (2.0 * Z95)
 
     def as_dict(self) -> dict[str, float]:
         """Value, low and high."""

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..diagnosis.report.explanation import title_of
+from ..diagnosis.inference.inference import title_of
 from ..reports import (
     AFTER,
     BEFORE,

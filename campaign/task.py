@@ -17,7 +17,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -129,7 +129,6 @@ class _Measured:
     low: Setting
     high: Setting
     warnings: tuple[str, ...]
-    product_of: Mapping[str, str] = field(default_factory=dict)
 
 
 def run_task(

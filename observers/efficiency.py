@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Setting
 from ..errors import FitError, InputError
+from ..generator.line.twin import Z95
 from .line_images import LineImages
 from .objects import ForeignObjects
 from .observe import SETTINGS_AT_ONCE, Observer, PreparedSettings, sizes_of_pod
@@ -57,7 +58,7 @@ class MeasuredSize:
         ends = [one for one in (self.low, self.high) if one is not None and one > 0]
         if not ends:
             return None
-        return max(sum(abs(math.log(one / self.a90)) for one in ends) / (1.959964 * len(ends)), 1e-3)
+        return max(sum(abs(math.log(one / self.a90)) for one in ends) / (Z95 * len(ends)), 1e-3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +76,7 @@ class LeftOut:
     @property
     def inside(self) -> bool:
         """Whether the measured a90 lies in the interval widened by its own error, in quadrature."""
-        width = math.hypot(0.5 * math.log(self.high / self.low), 1.959964 * self.log_sd)
+        width = math.hypot(0.5 * math.log(self.high / self.low), Z95 * self.log_sd)
         return abs(math.log(self.measured / self.predicted)) <= width
 
 

@@ -31,12 +31,11 @@ _MOST_PATCHES = 400
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProductTexture:
-    """A power law. Fields: amplitude_mm4 (A times a pixel's area), exponent b, lowest_per_mm (flat below), patches (read)."""
+    """A power law. Fields: amplitude_mm4 (A times a pixel's area), exponent b, lowest_per_mm (flat below)."""
 
     amplitude_mm4: float
     exponent: float
     lowest_per_mm: float
-    patches: int
 
     def power(self, bins: FrequencyBins, pixel_mm: float) -> FloatArray:
         """Power of the thickness in the bins (bin,), mm^2; pixel_mm: pitch in the object's plane."""
@@ -95,7 +94,6 @@ def texture_of_references(
         amplitude_mm4=float(math.exp(level_b) * line.object_pixel_mm**2),
         exponent=float(-slope_b),
         lowest_per_mm=float(math.exp(at[0])),
-        patches=len(squares),
     )
 
 

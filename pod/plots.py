@@ -1,4 +1,4 @@
-"""Plots that people in non-destructive testing expect. Each returns a matplotlib figure; the caller saves it."""
+"""Plots that people in non-destructive testing expect: `plot_` returns a matplotlib figure, `draw_` draws on the axes given."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..errors import FitError
 from .band import CHI2_95, curve_with_band
 from .comparison import Comparison
-from .hit_miss import PodFit, trusted_bound
+from .hit_miss import Z_TWO_SIDED, PodFit, trusted_bound
 from .likelihood import joint_region
 from .models import Alternative
 from .response import ResponseFit
@@ -24,15 +24,8 @@ Array = NDArray[np.float64]
 _BLUE, _ORANGE, _GREY, _RED = "#1f5fa8", "#d9822b", "#6b7280", "#b3261e"
 
 
-def plot_pod(fit: PodFit, table: Trials, *, size_label: str) -> "Figure":
-    """POD curve with its 95 % band, the share of hits in groups of sizes, hits and misses as ticks, a90 and a90/95."""
-    figure, axes = _figure(6.4, 4.4)
-    draw_pod(axes, fit, table, size_label=size_label)
-    return figure
-
-
 def draw_pod(axes: Any, fit: PodFit, table: Trials, *, size_label: str) -> None:
-    """`plot_pod` on the axes given."""
+    """POD curve with its 95 % band, the share of hits in groups of sizes, hits and misses as ticks, a90 and a90/95."""
     _draw_hits(axes, table, log_size=fit.log_size)
     _draw_curve(axes, fit, color=_BLUE, label=f"POD ({fit.link}, {fit.repeats})")
     bound = trusted_bound(fit.a90_95, separated=fit.separated)
@@ -104,24 +97,6 @@ def plot_models(alternatives: Sequence[Alternative]) -> "Figure":
     return figure
 
 
-def plot_response(
-    fit: ResponseFit,
-    size: Array,
-    response: Array,
-    *,
-    size_label: str,
-    response_label: str,
-    left: float | None = None,
-    right: float | None = None,
-) -> "Figure":
-    """Response against size with the fitted line, its 95 % scatter, the decision and censored responses marked."""
-    figure, axes = _figure(6.4, 4.4)
-    draw_response(
-        axes, fit, size, response, size_label=size_label, response_label=response_label, left=left, right=right
-    )
-    return figure
-
-
 def draw_response(
     axes: Any,
     fit: ResponseFit,
@@ -133,7 +108,7 @@ def draw_response(
     left: float | None = None,
     right: float | None = None,
 ) -> None:
-    """`plot_response` on the axes given."""
+    """Response against size with the fitted line, its 95 % scatter, the decision and censored responses marked."""
     size, response = np.asarray(size, dtype=float), np.asarray(response, dtype=float)
     cut = np.zeros(len(size), bool)
     if left is not None:
@@ -148,7 +123,7 @@ def draw_response(
     ends = float(size.min()), float(size.max())
     line = np.geomspace(*ends, 100) if fit.log_size else np.linspace(*ends, 100)
     x = np.log(line) if fit.log_size else line
-    for offset, style in ((0.0, "-"), (-1.96, "--"), (1.96, "--")):
+    for offset, style in ((0.0, "-"), (-Z_TWO_SIDED, "--"), (Z_TWO_SIDED, "--")):
         y = _untransformed(fit.intercept + fit.slope * x + offset * fit.scatter, fit.box_cox)
         axes.plot(line, y, color=_RED, lw=1.3 if offset == 0 else 0.8, ls=style)
     axes.axhline(fit.decision, color="black", lw=0.9, label="decision")

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from .hit_miss import Z_TWO_SIDED
 
 Array = NDArray[np.float64]
 
@@ -54,7 +55,7 @@ def compute_roc(noise: ArrayLike, signal: ArrayLike) -> Roc:
         least = 0.05 ** (1 / min(len(n), len(s)))
         low, high = (least, 1.0) if area == 1 else (0.0, 1 - least) if area == 0 else (area, area)
     else:
-        middle, wide = math.log(area / (1 - area)), 1.959963984540054 * error / (area * (1 - area))
+        middle, wide = math.log(area / (1 - area)), Z_TWO_SIDED * error / (area * (1 - area))
         low, high = (1 / (1 + math.exp(-v)) for v in (middle - wide, middle + wide))
     return Roc(
         decision=decision,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     )
     from .examples import Examples, examples_from_arrays, examples_from_dataset
     from .losses import LOSSES, cross_entropy_and_dice, dice_as_published
-    from .network import build_network, choose_device, predict_probabilities
+    from .network import build_network, choose_device
     from .own_module import build_module, recipe_for_module
     from .recipe import RECIPES, Recipe, recipe_for_fine_tuning
     from .runs import detect_with_networks, split_for_training, train_networks
@@ -55,7 +55,7 @@ _LAZY = {
     ),
     "examples": ("Examples", "examples_from_arrays", "examples_from_dataset"),
     "losses": ("LOSSES", "cross_entropy_and_dice", "dice_as_published"),
-    "network": ("build_network", "choose_device", "predict_probabilities"),
+    "network": ("build_network", "choose_device"),
     "own_module": ("build_module", "recipe_for_module"),
     "recipe": ("RECIPES", "Recipe", "recipe_for_fine_tuning"),
     "runs": ("detect_with_networks", "split_for_training", "train_networks"),
@@ -109,7 +109,6 @@ __all__ = [
     "learning_rate_at",
     "open_runs",
     "pad_to_multiple",
-    "predict_probabilities",
     "rate_of_crossed_trials",
     "read_result",
     "read_safetensors",

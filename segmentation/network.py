@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ._torch import load_segmentation_models, load_torch
 from .recipe import Recipe
-from .scaling import SCALINGS, crop_to_shape, pad_to_multiple
+from .scaling import crop_to_shape, pad_to_multiple
 
 _UNET_CHANNELS = (64, 32, 16, 16, 16)
 
@@ -108,14 +108,14 @@ def choose_device(name: str) -> str:
     return name
 
 
-def predict_probabilities(
-    network: Any, images: NDArray[Any], *, recipe: Recipe, device: str = "cpu", batch: int = 8
+def probabilities_from_scaled(
+    network: Any, scaled: NDArray[np.float32], *, recipe: Recipe, device: str = "cpu", batch: int = 8
 ) -> NDArray[np.float32]:
-    """Probability of a foreign object in every pixel (0..1), from pairs as measured or generated, of any size.
+    """Probability of a foreign object in every pixel (0..1), from scaled pairs of any size.
 
     Args:
         network: from `build_network`; it is put into evaluation mode.
-        images: (image, 2, row, column) -log(I/I0), low kV first.
+        scaled: (image, 2, row, column) -log(I/I0), low kV first, each scaled by `SCALINGS[recipe.scaling]`.
         recipe: the recipe that the network was trained with (scaling, classes).
         device: torch device on which the network is.
         batch: images at a time.
@@ -123,15 +123,6 @@ def predict_probabilities(
     Returns:
         (image, row, column) float32.
     """
-    scale = SCALINGS[recipe.scaling]
-    scaled = np.stack([scale(image) for image in images])
-    return probabilities_from_scaled(network, scaled, recipe=recipe, device=device, batch=batch)
-
-
-def probabilities_from_scaled(
-    network: Any, scaled: NDArray[np.float32], *, recipe: Recipe, device: str = "cpu", batch: int = 8
-) -> NDArray[np.float32]:
-    """As `predict_probabilities`, from images that are scaled already."""
     torch = load_torch()
     shape = (int(scaled.shape[-2]), int(scaled.shape[-1]))
     padded = pad_to_multiple(scaled, multiple=recipe.multiple_px)

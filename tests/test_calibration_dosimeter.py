@@ -426,6 +426,7 @@ def test_the_page_of_the_dosimeter_runs_as_it_is_written(tmp_path, capsys, monke
     assert main(["calibrate", "-o", "tube.h5"]) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.skipif(not (REALDATA / "dose_reports").exists(), reason="the published dose reports are not here")
 def test_dose_reports_carry_from_thin_to_thick_copper_and_tell_the_filtration(tmp_path):
@@ -453,6 +454,7 @@ def test_dose_reports_carry_from_thin_to_thick_copper_and_tell_the_filtration(tm
     assert predict_tube(thin, setting).air_kerma_uGy.value == pytest.approx(thick.value, rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.skipif(not (REALDATA / "table_transmission").exists(), reason="the published transmissions are not here")
 def test_a_table_fitted_behind_two_filters_is_known_behind_the_other_four(tmp_path):

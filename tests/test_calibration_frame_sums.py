@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from raytwin.calibration.frame_sums import effective_frames, merge_frame_sums, sum_frames
+from raytwin.calibration.frame_sums import effective_frames, sum_frames
 from raytwin.errors import InputError
 
 
@@ -39,18 +39,6 @@ def test_sums_are_numpy_s_however_the_frames_arrive(frames, cuts):
     assert total.maximum_DN == frames.max()
     assert total.maximum_count == np.sum(frames == frames.max())
     assert total.integer
-
-
-@given(stacks, stacks)
-def test_merged_parts_are_the_whole_but_for_the_pair_at_the_seam(first, second):
-    whole = np.concatenate([first, second]).astype(np.float64)
-    merged = merge_frame_sums(sum_frames([first]), sum_frames([second]))
-    assert merged.mean_DN == pytest.approx(whole.mean(axis=0), rel=1e-12, abs=1e-9)
-    assert merged.stack_variance_DN2 == pytest.approx(whole.var(axis=0, ddof=1), rel=1e-9, abs=1e-3)
-    steps = np.concatenate([steps_of(part) for part in (first, second)])
-    assert merged.pairs == len(steps)
-    assert merged.pair_variance_DN2 == pytest.approx(np.mean(steps**2, axis=0) / 2, rel=1e-12)
-    assert merged.maximum_count == np.sum(whole == whole.max())
 
 
 def test_large_offsets_do_not_cost_digits():
@@ -127,11 +115,6 @@ def test_a_single_frame_has_no_variance():
 def test_frames_that_cannot_be_summed_are_refused(pieces, message):
     with pytest.raises(InputError, match=message):
         sum_frames(pieces, name="series a")
-
-
-def test_parts_of_different_shapes_do_not_merge():
-    with pytest.raises(InputError, match="parts with frames of one shape"):
-        merge_frame_sums(sum_frames([np.ones((2, 3, 3))]), sum_frames([np.ones((2, 3, 4))]))
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

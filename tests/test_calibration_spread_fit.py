@@ -48,7 +48,7 @@ SPREADS = {
 
 def is_narrow(fit):
     assert fit.spread.model == "aperture"
-    assert abs(fit.sigma_px - 0.4) < 4.0 * fit.sigma_sd_px < 0.05
+    assert abs(fit.sigma_px - 0.4) < 4.0 * fit.spread_sd["sigma_px"] < 0.05
     # a weak tail may be as likely as none
     assert fit.criteria["Gaussian, light collected in pixels"] < 10.0
     assert fit.criteria["Gaussian, quanta counted in pixels"] > 100.0
@@ -134,7 +134,7 @@ def test_few_electrons_a_photon_are_white_noise_and_no_tail_of_the_spread():
         assert abs(fit.gain_DN[place] - gain) < 3.0 * fit.gain_sd_DN[place]
         assert fit.gain_sd_DN[place] < 0.2 * gain
         assert fit.white_fraction[place] == pytest.approx(white, rel=0.15)
-    assert abs(fit.sigma_px - spread.sigma_px) < 3.0 * fit.sigma_sd_px
+    assert abs(fit.sigma_px - spread.sigma_px) < 3.0 * fit.spread_sd["sigma_px"]
     assert fit.chi_square < 1.6 * fit.degrees
 
 
@@ -301,7 +301,7 @@ def test_a_screen_is_never_taken_for_one_without_a_tail():
     spread = Spread(sigma_px=0.7, tail_share=0.15, tail_px=1.0)
     series = powers(spread, seed=5, count=4)
     screen, other = (fit_spread(series, group=GROUPS, screen=declared) for declared in (True, False))
-    assert abs(screen.sigma_px - 0.7) < 3.0 * screen.sigma_sd_px
+    assert abs(screen.sigma_px - 0.7) < 3.0 * screen.spread_sd["sigma_px"]
     assert screen.family.endswith(("tail", "layer")) and screen.spread.tail_share > 0
     assert any("tail" not in family for family in other.criteria)
     # but for simulations, which these might be: one screen in a hundred

@@ -21,9 +21,9 @@ from raytwin.campaign.sweep import Progress, compare_tables, look_ahead, run_swe
 from raytwin.campaign.sweep_choice import Choice, choose, indistinct, paces, pareto_front, sentence
 from raytwin.campaign.sweep_file import CurveOptions, read_campaign, text_of_pair
 from raytwin.campaign.sweep_report import write_report
-from raytwin.campaign.sweep_runners import DaskCluster, Here, Processes
+from raytwin.campaign.sweep_runners import DaskCluster, Processes, _tried
 from raytwin.campaign.sweep_settings import Outlook, keep_best, labels_of, start_pair
-from raytwin.campaign.sweep_trial import seed_of
+from raytwin.campaign.sweep_trial import run_task, seed_of
 from raytwin.errors import InputError, MissingDependencyError, RaytwinError
 from raytwin.files import only_one
 from raytwin.generator.datasets.belt_motion import motion_strength_px, twin_on_belt
@@ -86,6 +86,17 @@ def sweep(campaign, folder, runner, **options):
         return run_sweep(campaign, folder, runner=runner, version="1", **options)
     finally:
         runner.close()
+
+
+class Here:
+    """In this process, one after the other."""
+
+    def run(self, tasks, done):
+        for task in tasks:
+            done(task, _tried(lambda task=task: run_task(task)))
+
+    def close(self):
+        """Nothing to close."""
 
 
 def files_of(folder):

@@ -7,11 +7,11 @@ import pytest
 
 from raytwin.checks.findings import Finding, FindingCode
 from raytwin.diagnosis.diagnose_session import _with_findings
-from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis
+from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, title_of
 from raytwin.diagnosis.judgement.answer import Cause, Diagnosis, Place
 from raytwin.diagnosis.judgement.held_out import Gap
 from raytwin.diagnosis.judgement.judgement import verdict_of
-from raytwin.diagnosis.report.explanation import location_text, paragraph, title_of
+from raytwin.diagnosis.report.explanation import location_text, paragraph
 from raytwin.diagnosis.report.report import next_steps
 
 

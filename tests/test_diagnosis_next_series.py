@@ -12,8 +12,8 @@ from raytwin.diagnosis.advice.next_series import (
     _separation,
     best_measurement,
     measurements_lacking,
-    proposal_text,
 )
+from raytwin.diagnosis.advice.plan import advice_text
 from raytwin.diagnosis.diagnose_session import diagnose
 from raytwin.diagnosis.model.changes import catalogue_variants
 from raytwin.diagnosis.problem.assemble import build_problem
@@ -80,11 +80,11 @@ def test_a_session_of_flats_and_products_lacks_all_that_isolates_effects(diagnos
 def test_an_edge_or_disc_is_asked_for_where_blur_of_the_source_ties_with_blur_of_the_panel(diagnosis):
     first, second = explanation(diagnosis, "focal_spot"), explanation(diagnosis, "mtf_tail")
     found = best_measurement(diagnosis.problem, first, second, rng=np.random.default_rng(3))
-    assert found.measurement.name in ("discs", "edges", "timed edges")
+    assert found.name in ("discs", "edges", "timed edges")
     assert found.separation_then > found.separation + 3.0
-    text = proposal_text(found, tuple(first), tuple(second))
+    text = advice_text([found], tuple(first), tuple(second), lately=False)
     titles = [EFFECTS[effect].title for effect in ("focal_spot", "mtf_tail")]
-    assert text.startswith(f"measure {found.measurement.text}, which would tell {titles[0]} from {titles[1]} by")
+    assert text.startswith(f"{found.what}, which would tell {titles[0]} from {titles[1]} by")
     # the answer's frames are drawn from the generator alone, and hardly matter
     again = best_measurement(diagnosis.problem, first, second, rng=np.random.default_rng(3))
     other = best_measurement(diagnosis.problem, first, second, rng=np.random.default_rng(4))
@@ -96,7 +96,7 @@ def test_an_edge_or_disc_is_asked_for_where_blur_of_the_source_ties_with_blur_of
 def test_beam_off_frames_are_asked_for_where_lag_ties_with_a_drifting_dark(problem):
     lag, drift = (at_strength(problem, effect) for effect in ("image_lag", "dark_drift"))
     found = best_measurement(problem, lag, drift, rng=np.random.default_rng(3))
-    assert found.measurement.name == "afterglow"
+    assert found.name == "afterglow"
     assert found.separation_then > 5.0
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from raytwin.acquisition.setting import setting_from_text
-from raytwin.diagnosis.advice.plan import Repeat, best_repeat, distinguishability, repeat_text, table_text
+from raytwin.diagnosis.advice.plan import Proposal, advice_text, best_repeat, distinguishability, table_text
 from raytwin.diagnosis.inference.curve_fits import fit_effects
 from raytwin.diagnosis.inference.inference import weigh_hypotheses
 from raytwin.diagnosis.inference.nuisances import Nuisances
@@ -321,16 +321,27 @@ def test_what_flats_or_darks_show_and_calibration_takes_in_only_in_part_is_tried
 
 
 def test_a_repeat_that_would_settle_a_tie_is_proposed_and_one_that_would_not_gives_way_to_what_isolates():
-    good = Repeat(series="dark_100ms", times=4, separation=2.0, separation_then=3.9)
-    assert repeat_text(good, ["dark_drift"], ["image_lag"]).startswith(
-        "take dark_100ms again with 4 times as many frames"
+    good = Proposal(what="take dark_100ms again", series="dark_100ms", separation=2.0, separation_then=3.9)
+    text = advice_text([good], ["dark_drift"], ["image_lag"], lately=False)
+    titles = [EFFECTS[effect].title for effect in ("dark_drift", "image_lag")]
+    assert text == (
+        f"take dark_100ms again, which would tell {titles[0]} from {titles[1]} by 3.9 standard deviations instead of 2.0"
     )
-    poor = Repeat(series="flat_90kV", times=4, separation=1.6, separation_then=1.7)
-    text = repeat_text(poor, ["filtration_error", "row_noise"], ["kv_error", "row_noise"])
-    assert text.startswith("no series of this session will do")
-    assert EFFECTS["kv_error"].isolated_by in text
-    assert EFFECTS["filtration_error"].isolated_by in text
-    assert EFFECTS["row_noise"].isolated_by + ";" not in text
+    poor = Proposal(what="take flat_90kV again", series="flat_90kV", separation=1.6, separation_then=1.7)
+    new = Proposal(
+        what="measure edges", name="edges", measured=({"kind": "object"},), separation=1.6, separation_then=2.2
+    )
+    explained = (["filtration_error", "row_noise"], ["kv_error", "row_noise"])
+    assert advice_text([poor, replace(new, separation_then=5.0)], *explained, lately=True).startswith(
+        "measure edges, which"
+    )
+    for proposals, lately, late in (([poor], True, False), ([poor, new], False, False), ([poor, new], True, True)):
+        text = advice_text(proposals, *explained, lately=lately)
+        assert text.startswith("nothing that was weighed tells")
+        assert ("among the calibrating series" in text) == late
+        assert EFFECTS["kv_error"].isolated_by in text
+        assert EFFECTS["filtration_error"].isolated_by in text
+        assert EFFECTS["row_noise"].isolated_by + ";" not in text
 
 
 @pytest.mark.parametrize(("since", "calibrating"), [("always", 1.0), ("calibration", 0.0)])

@@ -1,7 +1,6 @@
-"""Images made when asked for: their noise is decided by seed, epoch and position, in whatever process they are made."""
+"""Images made when asked for: their noise is decided by seed, epoch and position."""
 
 import json
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +9,7 @@ import pytest
 from raytwin.acquisition import Setting, read_dataset
 from raytwin.acquisition.dataset_io import DatasetRow, write_dataset
 from raytwin.acquisition.setting import filters_from_text
-from raytwin.campaign.fresh_noise import EpochSampler, FreshNoiseDataset
 from raytwin.cli import main
-from raytwin.errors import InputError
 from raytwin.generator.datasets.fresh import FreshReferences
 from raytwin.generator.datasets.generate import generate_dataset
 from raytwin.generator.twins.twin_io import write_twin
@@ -64,15 +61,15 @@ def source(twin, references, **options):
 
 def test_the_same_epoch_is_the_same_image_and_another_epoch_another_noise(twin, references):
     first, again = source(twin, references), source(twin, references)
-    one = first.example(2, epoch=4)
-    np.testing.assert_array_equal(one.log_images, again.example(2, epoch=4).log_images)
-    seen = [first.example(2, epoch=epoch).log_images for epoch in range(4)]
+    one = first.log_images(2, epoch=4)
+    np.testing.assert_array_equal(one, again.log_images(2, epoch=4))
+    seen = [first.log_images(2, epoch=epoch) for epoch in range(4)]
     for number, image in enumerate(seen):
         for other in seen[number + 1 :]:
             noise = np.corrcoef(image[0].ravel() - 0.5, other[0].ravel() - 0.5)[0, 1]
             assert not np.array_equal(image, other)
             assert abs(noise) < 0.9
-    assert not np.array_equal(one.log_images, source(twin, references, seed=4).example(2, epoch=4).log_images)
+    assert not np.array_equal(one, source(twin, references, seed=4).log_images(2, epoch=4))
 
 
 def test_fresh_noise_is_that_of_a_generated_dataset(tmp_path, twin, references):
@@ -81,69 +78,8 @@ def test_fresh_noise_is_that_of_a_generated_dataset(tmp_path, twin, references):
     with read_dataset(tmp_path / "g.h5") as made:
         written = made.images(slice(None))[:, :, :8].std(axis=(0, 2, 3))
     fresh = source(twin, references)
-    drawn = np.stack([fresh.example(number % 6, epoch=number // 6).log_images for number in range(48)])
+    drawn = np.stack([fresh.log_images(number % 6, epoch=number // 6) for number in range(48)])
     np.testing.assert_allclose(drawn[:, :, :8].std(axis=(0, 2, 3)), written, rtol=5 * np.sqrt(3 / (2 * 48 * 8 * 48)))
-
-
-def test_a_pickled_source_makes_the_same_images(twin, references):
-    fresh = source(twin, references)
-    image = fresh.example(1, epoch=2).log_images
-    again = pickle.loads(pickle.dumps(fresh))
-    np.testing.assert_array_equal(again.example(1, epoch=2).log_images, image)
-
-
-@pytest.mark.parametrize("workers", [0, 2])
-def test_any_number_of_workers_makes_the_same_images(twin, references, workers):
-    torch = pytest.importorskip("torch")
-    dataset = FreshNoiseDataset(source(twin, references))
-    sampler = EpochSampler(dataset, seed=5)
-    loader = torch.utils.data.DataLoader(
-        dataset, batch_size=3, sampler=sampler, num_workers=workers, persistent_workers=workers > 0
-    )
-    epochs = [[images.numpy() for images, _ in loader] for _ in range(2)]
-    for epoch, batches in enumerate(epochs):
-        order = np.random.default_rng([5, epoch]).permutation(6)
-        expected = np.stack([dataset[epoch, int(position)][0] for position in order])
-        np.testing.assert_array_equal(np.concatenate(batches), expected)
-    assert sampler.epoch == 2
-
-
-def test_items_by_position_follow_the_epoch_that_was_set(twin, references):
-    dataset = FreshNoiseDataset(source(twin, references))
-    assert len(dataset) == 6
-    dataset.set_epoch(3)
-    image, masks = dataset[4]
-    np.testing.assert_array_equal(image, dataset[3, 4][0])
-    np.testing.assert_array_equal(dataset[-2][0], image)
-    assert masks.shape == (2, *SHAPE)
-    assert masks[1].sum() == 60
-    with pytest.raises(IndexError):
-        dataset[6]
-    with pytest.raises(InputError, match="0 or more"):
-        dataset.set_epoch(-1)
-
-
-def test_a_transform_has_randomness_of_its_own_that_repeats(twin, references):
-    def shifted(image, masks, rng):
-        step = int(rng.integers(5))
-        return np.roll(image, step, axis=2), np.roll(masks, step, axis=2)
-
-    dataset = FreshNoiseDataset(source(twin, references), transform=shifted, seed=2)
-    first = dataset[1, 1]
-    np.testing.assert_array_equal(first[0], dataset[1, 1][0])
-    columns = {int(np.flatnonzero(dataset[epoch, 1][1][1].any(axis=0))[0]) for epoch in range(12)}
-    assert len(columns) > 2
-
-
-def test_a_sampler_shows_every_image_once_an_epoch_and_can_go_on(twin, references):
-    dataset = FreshNoiseDataset(source(twin, references))
-    sampler = EpochSampler(dataset, seed=1)
-    passes = [list(sampler) for _ in range(3)]
-    for epoch, items in enumerate(passes):
-        assert sorted(items) == [(epoch, position) for position in range(6)]
-    assert [position for _, position in passes[0]] != [position for _, position in passes[1]]
-    assert list(EpochSampler(dataset, seed=1, first_epoch=2)) == passes[2]
-    assert list(EpochSampler(dataset, shuffle=False)) == [(0, position) for position in range(6)]
 
 
 def test_examples_of_an_epoch_come_from_the_source_and_validation_stays_the_same(twin, references):
@@ -152,7 +88,7 @@ def test_examples_of_an_epoch_come_from_the_source_and_validation_stays_the_same
 
     def images(number, epoch):
         calls.append((number, epoch))
-        return fresh.example(number, epoch=epoch).log_images
+        return fresh.log_images(number, epoch=epoch)
 
     with read_dataset(references) as dataset:
         examples = examples_from_dataset(dataset, [1, 2], recipe=RECIPES["raytwin"], fresh=images)

@@ -410,7 +410,7 @@ def test_fresh_images_hold_the_effects(series_line, references):
     twin = with_effect(series_line, "row_noise", strength=2.0)
     fresh = FreshReferences(twin, str(references), low=LOW, high=HIGH, seed=1, product_material="water_liquid")
     plain = FreshReferences(series_line, str(references), low=LOW, high=HIGH, seed=1, product_material="water_liquid")
-    rows = [one.example(0, epoch=0).log_images[0][:, :6].mean(axis=1).std() for one in (fresh, plain)]
+    rows = [one.log_images(0, epoch=0)[0][:, :6].mean(axis=1).std() for one in (fresh, plain)]
     assert rows[0] > 1.5 * rows[1]
 
 

@@ -73,16 +73,6 @@ def test_quanta_have_the_mean_variance_and_skewness_of_a_compound_poisson_number
     check_moments(level, 0.3, shape, backend, key=12)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("level", "spread", "backend"),
-    [(level, spread, "cpu") for level in LEVELS for spread in (0.0, 0.3)]
-    + [(level, 0.3, "torch") for level in (0.1, 5.0, 20.1, 240.0)],
-)
-def test_ten_million_quanta_have_the_moments_of_a_compound_poisson_number(level, spread, backend):
-    check_moments(level, spread, TEN_MILLION, backend, key=21)
-
-
 def check_poisson(level, shape, key, backend="cpu"):
     noise = sample_quanta(constant(level, shape), gain_DN=1.0, key=key, backend=backend)
     count = np.rint(np.asarray(noise, dtype=np.float64) + np.float64(np.float32(level))).astype(np.int64).ravel()
@@ -104,12 +94,10 @@ def test_equal_quanta_follow_the_poisson_law(level):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("level", "backend"),
-    [(level, "cpu") for level in (0.1, 1.0, 3.0, 10.0, 19.9, 20.1, 25.0, 35.0, 100.0, 240.0, 2e3, 1e5)]
-    + [(level, "torch") for level in (1.0, 20.1, 240.0)],
+    ("level", "backend"), [(1.0, "cpu"), (19.9, "cpu"), (20.1, "cpu"), (240.0, "cpu"), (20.1, "torch")]
 )
 def test_ten_million_equal_quanta_follow_the_poisson_law(level, backend):
-    assert check_poisson(level, TEN_MILLION, key=41, backend=backend) > 1e-3 / 15
+    assert check_poisson(level, TEN_MILLION, key=41, backend=backend) > 1e-3 / 5
 
 
 @pytest.mark.parametrize("level", [0.05, 0.7, 4.0])
@@ -162,14 +150,6 @@ def check_covariances(level, shape, backend, key):
 @pytest.mark.parametrize(("level", "backend"), [(0.3, "cpu"), (150.0, "cpu"), (1500.0, "torch")])
 def test_neighbours_have_the_covariance_of_the_spread(level, backend):
     check_covariances(level, MILLION if backend == "cpu" else (1, 400, 500), backend, key=51)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("level", "backend"), [(level, "cpu") for level in (0.1, 1.0, 19.0, 150.0, 1.5e3, 1e5)] + [(150.0, "torch")]
-)
-def test_ten_million_neighbours_have_the_covariance_of_the_spread(level, backend):
-    check_covariances(level, TEN_MILLION, backend, key=61)
 
 
 def test_there_are_no_seams_where_threads_or_vectors_meet_and_none_at_the_borders():

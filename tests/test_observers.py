@@ -209,7 +209,7 @@ def test_exposure_motion_and_texture_move_a90_the_way_they_must(line):
     moving = observe_settings(line, [pair_at(40, belt_speed_mm_s=speed) for speed in (1, 30, 60)], objects)
     assert moving.a90[0] == pytest.approx(at_rest.a90[2], rel=2e-3)
     assert at_rest.a90[2] < moving.a90[1] < moving.a90[2]
-    texture = ProductTexture(amplitude_mm4=0.5, exponent=3.0, lowest_per_mm=0.02, patches=1)
+    texture = ProductTexture(amplitude_mm4=0.5, exponent=3.0, lowest_per_mm=0.02)
     plain, textured = (
         observe_settings(line, [pair_at(80)], objects, observer=Observer(image="low"), texture=one)
         for one in (None, texture)

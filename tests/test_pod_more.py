@@ -555,27 +555,33 @@ def fitted():
 
 
 def test_every_plot_draws_what_it_is_given(fitted, tmp_path):
+    from matplotlib.figure import Figure
+
     from raytwin.pod import plots
 
     fit, table = fitted
     response = 1 + 30 * table.size + np.random.default_rng(1).normal(0, 1, 100)
     line = fit_response_pod(table.size, response, decision=5, left=2)
+    drawn = [Figure() for _ in range(3)]
+    axes = [figure.subplots() for figure in drawn]
+    plots.draw_pod(axes[0], fit, table, size_label="contrast")
+    plots.draw_response(
+        axes[1], line, table.size, response, size_label="contrast", response_label="probability", left=2
+    )
+    plots.draw_pod(axes[2], fit_pod(table.size, np.ones(100)), table, size_label="contrast")
     figures = [
-        plots.plot_pod(fit, table, size_label="contrast"),
+        *drawn,
         plots.plot_joint_region(fit),
         plots.plot_models(compare_models(table)),
-        plots.plot_response(line, table.size, response, size_label="contrast", response_label="probability", left=2),
         plots.plot_comparison(compare_pod(table, table), size_label="contrast"),
         plots.plot_roc(compute_roc(response[:40], response[40:])),
-        plots.plot_pod(fit_pod(table.size, np.ones(100)), table, size_label="contrast"),
     ]
     for place, figure in enumerate(figures):
         path = tmp_path / f"{place}.png"
         figure.savefig(path)
         assert path.stat().st_size > 4000
-    axes = figures[0].axes[0]
-    assert axes.get_xlabel() == "contrast"
-    assert any(f"a90 = {fit.a90:.3g}" in text.get_text() for text in axes.texts)
+    assert axes[0].get_xlabel() == "contrast"
+    assert any(f"a90 = {fit.a90:.3g}" in text.get_text() for text in axes[0].texts)
     with pytest.raises(FitError, match="no joint region"):
         plots.plot_joint_region(fit_pod([1, 2, 3, 4], [0, 0, 1, 1]))
 

@@ -8,13 +8,14 @@ import pytest
 from raytwin.errors import FileFormatError, InputError
 from raytwin.segmentation import (
     RECIPES,
+    SCALINGS,
     STARTER_PATH,
     build_network,
-    predict_probabilities,
     read_safetensors,
     starter_recipe,
     write_safetensors,
 )
+from raytwin.segmentation.network import probabilities_from_scaled
 from raytwin.segmentation.runs import _starting_weights
 
 
@@ -33,12 +34,13 @@ def pair_with_object(seed):
 def test_the_starter_finds_an_object_that_a_fresh_network_does_not():
     recipe, weights = read_safetensors(STARTER_PATH)
     image, mask = pair_with_object(1)
+    scaled = SCALINGS[recipe.scaling](image)[None]
     found = []
     for trained in (True, False):
         network = build_network(recipe, seed=0, pretrained=False)
         if trained:
             network.load_state_dict(weights)
-        marked = predict_probabilities(network, image[None], recipe=recipe)[0] > 0.5
+        marked = probabilities_from_scaled(network, scaled, recipe=recipe)[0] > 0.5
         found.append(marked[mask].mean())
         assert marked[:5].sum() == 0
     assert found[0] > 0.5

@@ -28,7 +28,6 @@ from raytwin.segmentation import (
     iterate_training,
     learning_rate_at,
     open_runs,
-    predict_probabilities,
     read_weights,
     recipe_for_fine_tuning,
     recipe_of_start,
@@ -37,7 +36,8 @@ from raytwin.segmentation import (
     train_networks,
 )
 from raytwin.segmentation import runs as runs_module
-from raytwin.segmentation.runs_io import network_folder, read_state, write_state
+from raytwin.segmentation.network import probabilities_from_scaled
+from raytwin.segmentation.runs_io import network_folder, read_state
 
 SHAPE = (20, 36)
 QUICK = dataclasses.replace(RECIPES["raytwin"], steps=None, epochs=2, batch=2)
@@ -252,7 +252,8 @@ def test_the_same_seed_gives_the_same_starting_weights_and_leaves_torch_s_state_
 @pytest.mark.parametrize("shape", [(1, 1), (17, 33), (32, 48)])
 def test_probabilities_come_back_in_the_shape_of_the_image(shape):
     network = build_network(QUICK, seed=0)
-    found = predict_probabilities(network, np.random.default_rng(0).random((2, 2, *shape)), recipe=QUICK)
+    images = np.random.default_rng(0).random((2, 2, *shape), dtype=np.float32)
+    found = probabilities_from_scaled(network, images, recipe=QUICK)
     assert found.shape == (2, *shape)
     assert np.all((found >= 0) & (found <= 1))
 
@@ -303,30 +304,11 @@ def test_without_torch_the_message_holds_the_command_that_installs_it(monkeypatc
 # Training
 
 
-def _train(recipe=QUICK, *, resume_after=None, tmp_path=None, seed=7, n=4):
-    """The last state of a run; with `resume_after` stopped after that epoch and gone on with from its file."""
+def _train(recipe=QUICK, *, seed=7, n=4):
+    """The last state of a run."""
     images, masks = _pairs(n)
     train = examples_from_arrays(images, masks, recipe=recipe)
-    options = {"recipe": recipe, "seed": seed}
-    if resume_after is None:
-        return list(iterate_training(train, train, **options))[-1]
-    from raytwin.segmentation.runs_io import create_or_resume_runs, make_configuration
-
-    runs = create_or_resume_runs(tmp_path / "r", make_configuration(recipe, seed=seed, dataset_sha256="0" * 64))
-    for state in iterate_training(train, train, **options):
-        write_state(runs, 0, state)
-        if state.epochs_done == resume_after:
-            break
-    return list(iterate_training(train, train, **options, resume=read_state(runs, 0)))[-1]
-
-
-def test_a_resumed_run_ends_in_the_weights_and_history_of_an_uninterrupted_one(tmp_path):
-    whole = _train(n=2)
-    resumed = _train(resume_after=1, tmp_path=tmp_path, n=2)
-    assert [epoch.loss for epoch in resumed.history] == [epoch.loss for epoch in whole.history]
-    assert (resumed.best_epoch, resumed.best_loss) == (whole.best_epoch, whole.best_loss)
-    _assert_same(dict(resumed.weights), dict(whole.weights))
-    _assert_same(dict(resumed.best_weights), dict(whole.best_weights))
+    return list(iterate_training(train, train, recipe=recipe, seed=seed))[-1]
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_seed_others():

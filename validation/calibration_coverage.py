@@ -33,6 +33,7 @@ from raytwin.calibration.calibrate import calibrate_twin, calibration_answer
 from raytwin.calibration.validate import validate_twin
 from raytwin.errors import InputError, RaytwinError
 from raytwin.files import whole_file
+from raytwin.generator.line.twin import Z95
 from raytwin.generator.predictions.predict import predict_flatfield
 from raytwin.lab.families import FAMILIES
 from raytwin.lab.protocols import run_protocol, truth_path
@@ -162,7 +163,7 @@ def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         relative = value / truth - 1.0
         inside = int(np.sum((low <= truth) & (truth <= high)))
         n = len(chosen)
-        z = (value - truth) / np.maximum((high - low) / (2 * 1.959964), 1e-300)
+        z = (value - truth) / np.maximum((high - low) / (2 * Z95), 1e-300)
         table.append(
             {
                 "quantity": quantity,
@@ -176,7 +177,7 @@ def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 "z_mean": float(np.mean(z)),
                 "z_sd": float(np.std(z)),
                 # in half-widths: no value may be off by more than three
-                "worst_half_widths": float(np.max(np.abs(z))) / 1.959964,
+                "worst_half_widths": float(np.max(np.abs(z))) / Z95,
             }
         )
     return table

@@ -26,13 +26,13 @@ from raytwin.diagnosis.problem.assemble import problem_of
 from raytwin.diagnosis.session.preparation import prepare_session
 from raytwin.generator.effects import EFFECTS
 from raytwin.generator.effects.effect import Reading
+from raytwin.generator.line.twin import Z95
 from raytwin.lab import EffectRequest, run_protocol
 from raytwin.lab.cases import COARSE, FINE, MAY_COME_LATER
 from raytwin.lab.effects import EFFECTS as LAWS
 
 HARDLY_SHOWN = ("composition_error",)  # some per cent lie within what attenuation tables leave open (LIMITS weak-1)
 _COUNTS_AS = 4.0  # sessions: what is known of laws in general
-_WITHIN = 1.959964
 
 
 def request_of(effect: str, rng: np.random.Generator) -> tuple[EffectRequest, str]:
@@ -68,7 +68,7 @@ def tell_strengths(paths: list[Path]) -> None:
     for effect in sorted({row["planted"] for row in rows}):
         own = [row for row in rows if row["planted"] == effect]
         off = np.array([math.log(row["found"][0] / row["strength"]) for row in own])
-        of_fit = np.array([math.log(row["fitted"][2] / row["fitted"][1]) / (2.0 * _WITHIN) for row in own])
+        of_fit = np.array([math.log(row["fitted"][2] / row["fitted"][1]) / (2.0 * Z95) for row in own])
         beyond = float(np.sum(np.maximum(off**2 - of_fit**2, 0.0)))
         sd = math.sqrt((_COUNTS_AS * Reading().law_sd ** 2 + beyond) / (_COUNTS_AS + len(own)))
         told = ", ".join(

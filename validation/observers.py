@@ -23,6 +23,7 @@ from raytwin.cli import main as raytwin
 from raytwin.files import whole_file
 from raytwin.generator.datasets.belt_motion import twin_on_belt
 from raytwin.generator.datasets.generate import generate_dataset
+from raytwin.generator.line.twin import Z95
 from raytwin.generator.twins.twin_io import read_twin
 from raytwin.observers import DETECTORS, LineImages, MeasuredSize, Observer, fit_efficiency, objects_of_references
 from raytwin.observers.efficiency import predicted_sizes
@@ -170,11 +171,11 @@ def compared(line, objects, measured, chosen, detector):
     for place, number in enumerate(others):
         one = measured[number]
         value, low, high = (float(end[place]) for end in (found.a90, found.low, found.high))
-        sd = math.hypot(math.log(high / low) / (2 * 1.959964), one.log_sd)
+        sd = math.hypot(math.log(high / low) / (2 * Z95), one.log_sd)
         rows.append({
             "setting": f"{one.pair[0]};{one.pair[1]}", "networks": one.a90, "networks_low": one.low, "networks_high": one.high,
             "observer": value, "low": low, "high": high, "inside": low <= one.a90 <= high,
-            "inside_with_measured_error": abs(math.log(one.a90 / value)) <= 1.959964 * sd,
+            "inside_with_measured_error": abs(math.log(one.a90 / value)) <= Z95 * sd,
         })  # fmt: skip
     ratio = np.log([row["networks"] / row["observer"] for row in rows])
     errors = np.array([measured[number].log_sd for number in others])

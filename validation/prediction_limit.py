@@ -58,7 +58,7 @@ from raytwin.calibration.priors import (
     draw_parameters,
     spread_of,
 )
-from raytwin.generator.line.twin import Twin
+from raytwin.generator.line.twin import Z95, Twin
 from raytwin.generator.predictions.predict import predict_flatfield
 from raytwin.lab.attenuation import composition, mu_per_mm
 from raytwin.lab.bench import Bench
@@ -97,7 +97,6 @@ SETTINGS = tuple(
     )
 )
 DARK_MS = 20.0
-Z95 = 1.959964
 Array = NDArray[np.float64]
 
 

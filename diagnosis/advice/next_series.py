@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from ...acquisition.acquisition_io import open_acquisition, write_acquisition
 from ...acquisition.setting import Filter, Setting, text_from_filters
 from ...errors import InputError, RaytwinError
-from ...generator.effects import EFFECTS
 from ...generator.frames.conditions import with_conditions
 from ...generator.frames.line_model import LineModel
 from ...generator.line.series_request import SeriesRequest
@@ -31,7 +30,7 @@ from ..model.changes import Variant
 from ..model.curves import Curve
 from ..problem.assemble import build_problem
 from ..problem.problem import Problem
-from .plan import length
+from .plan import Proposal, length
 
 FRAMES = 20  # of each series that is planned
 Explanation = Mapping[str, tuple[Curve, float]]  # effect -> curve of the problem, strength
@@ -77,27 +76,6 @@ class Measurement:
     name: str
     text: str
     series: tuple[PlannedSeries, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Proposal:
-    """A measurement and the separation of two explanations, standard deviations: as the session is, and with it."""
-
-    measurement: Measurement
-    separation: float
-    separation_then: float
-
-
-def proposal_text(proposal: Proposal, first: Sequence[str], second: Sequence[str]) -> str:
-    """What to measure to tell two explanations (effects) apart, and how far apart it would set them."""
-    one, other = (
-        " and ".join(EFFECTS[effect].title if effect in EFFECTS else effect for effect in some)
-        for some in (first, second)
-    )
-    return (
-        f"measure {proposal.measurement.text}, which would tell {one} from {other} by"
-        f" {proposal.separation_then:.1f} standard deviations instead of {proposal.separation:.1f}"
-    )
 
 
 _Scene = tuple[str, dict[str, NDArray[np.float64]]]  # kind, and thickness maps (row, column), mm, by material
@@ -349,7 +327,15 @@ def best_measurement(
             dtype=np.intp,
         )
         then = _separation(problem, taken, rows, first, second) if rows.size else now
-        proposals.append(Proposal(measurement=measurement, separation=now, separation_then=then))
+        proposals.append(
+            Proposal(
+                what=f"measure {measurement.text}",
+                name=measurement.name,
+                measured=tuple(item.as_dict() for item in measurement.series),
+                separation=now,
+                separation_then=then,
+            )
+        )
     return max(proposals, key=lambda item: item.separation_then)
 
 

@@ -7,12 +7,14 @@ taken on another day, says as much.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...generator.effects import EFFECTS
+from ..inference.inference import title_of
 from ..inference.nuisances import Nuisances, Whitening
 from ..model.curves import Curve
 from ..problem.problem import Problem
@@ -124,49 +126,62 @@ def _usual(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Repeat:
-    """A series to take again with more frames: its name, how many times as many, separation of a tie now and then."""
+class Proposal:
+    """What to measure to distinguish two explanations, in words, and their separation: as the session is, and with it.
 
-    series: str
-    times: int
+    Fields: what; series: its name, where one of the session is taken again; measured: new series, as an acquisition's attributes;
+    separation, separation_then, standard deviations.
+    """
+
+    what: str
     separation: float
     separation_then: float
+    series: str = ""
+    measured: tuple[Mapping[str, Any], ...] = ()
+    name: str = ""
+
+    @property
+    def settles(self) -> bool:
+        """Whether the matter is settled with it."""
+        return self.separation_then >= WORTH_IT
 
 
-def repeat_text(
-    repeat: Repeat, first: Sequence[str], second: Sequence[str], *, other: tuple[str, float] | None = None
-) -> str:
-    """What to measure to tell two explanations (effects) apart: the repeat, or, where that is not worth it, what isolates them.
+def advice_text(proposals: Sequence[Proposal], first: Sequence[str], second: Sequence[str], *, lately: bool) -> str:
+    """What to measure to distinguish two explanations (effects): what settles it, or, where nothing does, what isolates them.
 
-    other: the best measurement that the session lacks, in words, and the separation with it, which is not worth it either: what
-    the calibration has not seen before a change cannot be made up for after it.
+    Args:
+        proposals: what was weighed, the best one of each kind.
+        first, second: the effects of the explanations.
+        lately: all of them came after the calibration: what that has not seen cannot be made up for.
     """
-    names = " and ".join(first) + " from " + " and ".join(second)
-    if repeat.separation_then >= WORTH_IT:
+    names = " from ".join(" and ".join(map(title_of, effects)) for effects in (first, second))
+    best = next((item for item in proposals if item.settles), None)
+    if best is not None:
         return (
-            f"take {repeat.series} again with {repeat.times} times as many frames, which would tell {names} by"
-            f" {repeat.separation_then:.1f} standard deviations instead of {repeat.separation:.1f}"
+            f"{best.what}, which would tell {names} by {best.separation_then:.1f} standard deviations instead of"
+            f" {best.separation:.1f}"
         )
     isolating = "; ".join(
-        f"{effect} by {EFFECTS[effect].isolated_by}"
+        f"{title_of(effect)} by {EFFECTS[effect].isolated_by}"
         for effect in (*first, *second)
         if effect in EFFECTS and (effect in first) != (effect in second)
     )
-    too_little = (
-        f"no series of this session will do: {repeat.times} times as many frames of the best one, {repeat.series}, tell"
-        f" {names} by {repeat.separation_then:.1f} standard deviations instead of {repeat.separation:.1f}"
+    weighed = "; ".join(f"{item.what}: {item.separation_then:.1f}" for item in proposals)
+    text = (
+        f"nothing that was weighed tells {names} by {WORTH_IT:g} standard deviations ({weighed}; now"
+        f" {proposals[0].separation:.1f})."
     )
-    if other is None:
-        return f"{too_little}. Measure what isolates them: {isolating}"
-    return (
-        f"{too_little}; nor will {other[0]} ({other[1]:.1f}). A change is told by what was measured before it as well: have among"
-        f" the calibrating series, too, what isolates them: {isolating}"
-    )
+    if lately and any(item.measured for item in proposals):
+        return (
+            f"{text} A change is told by what was measured before it as well: have among the calibrating series, too, what"
+            f" isolates them: {isolating}"
+        )
+    return f"{text} Measure what isolates them: {isolating}"
 
 
 def best_repeat(
     problem: Problem, first: Mapping[str, tuple[Curve, float]], second: Mapping[str, tuple[Curve, float]]
-) -> Repeat | None:
+) -> Proposal | None:
     """The series whose repetition would separate two explanations most; None where they are alike everywhere.
 
     Args:
@@ -187,15 +202,15 @@ def best_repeat(
     moved = whitening.apply(apart[None, :])[0]
     weight = Nuisances(whitening.factors).solve(moved) * moved
     by_series = np.bincount(problem.series_of, weights=weight, minlength=len(problem.views))
-    found: list[Repeat] = []
+    found: list[Proposal] = []
     for number in np.argsort(-by_series)[:_CANDIDATES]:
         # more frames leave less counting noise, and all that is no noise as it was
         shrunk = np.where(problem.series_of == number, 1.0 - (1.0 - 1.0 / _REPEATS) * problem.noise**2, 1.0)
         root = np.sqrt(shrunk)
         found.append(
-            Repeat(
+            Proposal(
+                what=f"take {problem.views[int(number)].session.name} again with {_REPEATS} times as many frames",
                 series=problem.views[int(number)].session.name,
-                times=_REPEATS,
                 separation=now,
                 separation_then=length(problem.factors / root[:, None], problem.blocks, apart / root),
             )

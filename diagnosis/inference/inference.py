@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ...generator.effects import EFFECTS
 from ..model.curves import Curve
 from .curve_fits import CurveFit, interval_of, log_mean_exp
 from .discrepancy import LEVELS, at_most_off, log_frequency, log_misfit
@@ -30,6 +31,13 @@ UNKNOWN = "unknown_effect"
 _WITH_MISFIT = 3  # effects, and pairs, the likeliest, whose misfit is looked at
 # the likeliest effects that are the first of a pair: with six the same are named (notebook, ablation)
 _PAIRS_FROM = 2
+
+
+def title_of(effect: str) -> str:
+    """An effect, or what is not in the catalogue, in words."""
+    if effect == UNKNOWN:
+        return "an effect that is not in the catalogue"
+    return EFFECTS[effect].title if effect in EFFECTS else effect
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

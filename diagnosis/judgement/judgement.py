@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.line.twin import Twin
-from ..advice.next_series import best_measurement, proposal_text
-from ..advice.plan import WORTH_IT, best_repeat, repeat_text
+from ..advice.next_series import best_measurement
+from ..advice.plan import advice_text, best_repeat
 from ..inference.curve_fits import CurveFit, fit_effects
 from ..inference.discrepancy import FARTHEST_LEVEL, LEVELS, law_terms
 from ..inference.in_series import in_some_series
-from ..inference.inference import UNKNOWN, Hypothesis, weigh_hypotheses
+from ..inference.inference import UNKNOWN, Hypothesis, title_of, weigh_hypotheses
 from ..inference.inner_parameters import with_inner_open
 from ..inference.nuisances import LocalNuisances, Nuisances, Whitening
 from ..inference.observed import Observed
@@ -377,7 +377,7 @@ def _of_another_strength(problem: Problem, verdict: Verdict) -> tuple[str, ...]:
 def _in_some(leading: Hypothesis) -> tuple[str, ...]:
     """What to say of effects that act in some series only."""
     return tuple(
-        f"{EFFECTS[effect].title} acts in {', '.join(curve.variant.series)} only: the improved twin is left without it"
+        f"{title_of(effect)} acts in {', '.join(curve.variant.series)} only: the improved twin is left without it"
         for effect, curve in leading.variants.items()
         if curve.variant.series
     )
@@ -430,7 +430,7 @@ def _out_of_reach(problem: Problem, curves: Sequence[Curve], observed: Observed)
 def _next_measurement(
     problem: Problem, tied: Sequence[Hypothesis], rng: np.random.Generator
 ) -> Mapping[str, Any] | None:
-    """What to measure to tell the two likeliest explanations apart, found from the forward model and its noise.
+    """What to measure to distinguish the two likeliest explanations, found from the forward model and its noise.
 
     A series taken again where that settles it, else the measurement that the session lacks which does.
     """
@@ -439,29 +439,22 @@ def _next_measurement(
     first, second = (
         {effect: (item.variants[effect], item.strengths[effect][0]) for effect in item.effects} for item in tied[:2]
     )
-    answer: dict[str, Any] = {"separates": sorted({effect for item in tied[:2] for effect in item.effects})}
-    found, other = best_repeat(problem, first, second), None
-    if found is None or found.separation_then < WORTH_IT:
-        planned = best_measurement(problem, first, second, rng=rng)
-        if planned is not None and (planned.separation_then >= WORTH_IT or found is None):
-            return answer | {
-                "text": proposal_text(planned, tied[0].effects, tied[1].effects),
-                "measurement": planned.measurement.name,
-                "measure": [item.as_dict() for item in planned.measurement.series],
-                "separation": planned.separation,
-                "separation_then": planned.separation_then,
-            }
-        every = [curve.variant for curve, _ in (*first.values(), *second.values())]
-        if planned is not None and all(variant.since == "calibration" for variant in every):
-            other = planned.measurement.text, planned.separation_then
-    if found is None:
+    repeat = best_repeat(problem, first, second)
+    new = None if repeat is not None and repeat.settles else best_measurement(problem, first, second, rng=rng)
+    proposals = [item for item in (repeat, new) if item is not None]
+    if not proposals:
         return None
-    return answer | {
-        "text": repeat_text(found, tied[0].effects, tied[1].effects, other=other),
-        "series": found.series,
-        "separation": found.separation,
-        "separation_then": found.separation_then,
+    best = next((item for item in proposals if item.settles), proposals[0])
+    lately = all(curve.variant.since == "calibration" for curve, _ in (*first.values(), *second.values()))
+    answer: dict[str, Any] = {
+        "separates": sorted({*first, *second}),
+        "text": advice_text(proposals, tied[0].effects, tied[1].effects, lately=lately),
+        "separation": best.separation,
+        "separation_then": best.separation_then,
     }
+    if best.series:
+        return answer | {"series": best.series}
+    return answer | {"measurement": best.name, "measure": list(best.measured)}
 
 
 def _threshold(probes: int) -> float:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from ...checks.findings import FindingCode
 from ...generator.effects import EFFECTS
-from ..inference.inference import UNKNOWN
+from ..inference.inference import title_of
 from ..judgement.answer import EXPLAINED, Cause, Diagnosis, Place
 from ..judgement.held_out import Gap
 
@@ -31,13 +31,6 @@ _FINDING_TITLES = {
     FindingCode.STOPS: "Numbers are cut off early",
     FindingCode.SPECTRUM: "The flats fit no spectrum",
 }
-
-
-def title_of(effect: str) -> str:
-    """The effect's name in words."""
-    if effect == UNKNOWN:
-        return "an effect that is not in the catalogue"
-    return EFFECTS[effect].title if effect in EFFECTS else effect
 
 
 def axis_text(axis: str) -> str:

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.effects import EFFECTS
 from ...reports import AFTER, BEFORE, Bars, Chart, Line, Picture, Points, Rule
 from ...reports.chart import SERIES_COLOURS, SHAPES, Shape, asinh_ticks, rows_px
-from ..inference.inference import UNKNOWN
+from ..inference.inference import title_of
 from ..judgement.answer import Diagnosis
 from ..problem.problem import SeriesView
 from .explanation import axis_text
@@ -255,19 +254,10 @@ def _shape(number: int) -> Shape:
     return SHAPES[number % len(SHAPES)]
 
 
-def hypothesis_text(effects: tuple[str, ...]) -> str:
-    """The effects of a hypothesis in words."""
-    if not effects:
-        return "no gap"
-    if effects == (UNKNOWN,):
-        return "an unknown effect"
-    return " + ".join(EFFECTS[one].title if one in EFFECTS else one for one in effects)
-
-
 def hypotheses_chart(diagnosis: Diagnosis) -> Chart:
     """Probabilities of the leading hypotheses."""
     shown = [item for item in diagnosis.hypotheses if item.probability > _LEAST_PROBABILITY][:_MOST_HYPOTHESES]
-    names = [hypothesis_text(item.effects) for item in shown]
+    names = [" + ".join(map(title_of, item.effects)) or "no gap" for item in shown]
     y = np.arange(len(shown), dtype=float)
     return Chart(
         name="hypotheses",

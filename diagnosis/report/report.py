@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ...checks.findings import FindingCode
 from ...generator.effects import EFFECTS
 from ...reports import Figure, SortedTable, write_page
+from ..inference.inference import title_of
 from ..judgement.answer import Cause, Diagnosis
 from ..problem.assemble import map_changes
 from ..session.binned_twin import effect_in_squares
@@ -24,7 +25,6 @@ from .explanation import (
     rivals,
     strained_text,
     strength_text,
-    title_of,
     verdict_text,
 )
 from .figures import gap_maps, held_out_chart, hypotheses_chart, places_chart, transmission_curves

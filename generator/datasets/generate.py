@@ -61,7 +61,10 @@ def refuse_pair(low: Setting, high: Setting, *, bad_pixels: str) -> None:
         raise InputError(BAD_PIXEL_MAP, received=bad_pixels, expected="one of " + ", ".join(BAD_PIXELS))
     if high.kV <= low.kV:
         raise InputError(
-            "settings", received=f"low {low.kV:g} kV, high {high.kV:g} kV", expected="low kV below high kV"
+            "settings",
+            received=f"low {low.kV:g} kV, high {high.kV:g} kV",
+            expected="low kV below high kV",
+            remedy="exchange low and high, or give another kV",
         )
 
 

@@ -55,7 +55,10 @@ class KnownScenes:
         refuse_without_spectrum(twin)
         if high.kV <= low.kV:
             raise InputError(
-                "settings", received=f"low {low.kV:g} kV, high {high.kV:g} kV", expected="low kV below high kV"
+                "settings",
+                received=f"low {low.kV:g} kV, high {high.kV:g} kV",
+                expected="low kV below high kV",
+                remedy="exchange low and high, or give another kV",
             )
         line = present_line(twin)
         self.twin = line.twin

@@ -52,7 +52,12 @@ def _cover(state: LineState, parameters: Mapping[str, float], context: LineConte
     if parameters["strength"] == 0 or (absorbed and not context.has_scene and request.panel_rotation_deg == 0):
         return state
     if model is None or context.project is None or context.weights is None or context.energies_keV is None:
-        raise InputError("effect grey_absorber", received="a twin without spectral part", expected="a twin with one")
+        raise InputError(
+            "effect grey_absorber",
+            received="a twin without spectral part",
+            expected="a twin with one",
+            remedy="calibrate from flats that state kV and tube load",
+        )
     energies = context.energies_keV
     mu = model.mu(_SHEET)
     # a beam of less than the stated energy has no such photons, and the sheet is the same

@@ -33,7 +33,12 @@ def _tilt(state: LineState, parameters: Mapping[str, float], context: LineContex
     if parameters["strength"] == 0 or (absorbed and not context.has_scene and request.panel_rotation_deg == 0):
         return state
     if model is None or context.project is None or context.weights is None or state.parameters is None:
-        raise InputError("effect heel", received="a twin without spectral part", expected="a twin with one")
+        raise InputError(
+            "effect heel",
+            received="a twin without spectral part",
+            expected="a twin with one",
+            remedy="calibrate from flats that state kV and tube load",
+        )
     if request.setting is None:
         return state
     bare = model.moment_weights(state.parameters, OpenBeam(kV=request.setting.kV, filters=()))[0]

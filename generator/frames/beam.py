@@ -106,7 +106,12 @@ class BeamProjection:
     def moments(self, name: str, weights: FloatArray) -> FloatArray:
         """Maps (k, row, column) of sum_E weights exp(-mu t), or (k, 1, 1) in the open field; kept under `name`."""
         if self.spectrum is None:
-            raise InputError("scene", received="a twin without spectral part", expected="one with a spectral part")
+            raise InputError(
+                "scene",
+                received="a twin without spectral part",
+                expected="one with a spectral part",
+                remedy="calibrate from flats that state kV and tube load",
+            )
         return self.spectrum.behind(self.scene, name, weights)[0]
 
 

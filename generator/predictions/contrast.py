@@ -297,7 +297,12 @@ def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | N
     # fewer than one photon in 1e30 is no beam, whatever floating point can still hold
     if not rate[0] > 1e-30 * float(bare @ response.mean_deposited_keV):
         layers = setting.filters if line.tube is not None else (*line.inherent, *setting.filters)
-        raise InputError("filter", received=text_from_filters(layers), expected="layers that let some photons through")
+        raise InputError(
+            "filter",
+            received=text_from_filters(layers),
+            expected="layers that let some photons through",
+            remedy="take thinner filters or a higher tube voltage",
+        )
     distance = setting.source_detector_mm or line.source_detector_mm
     return _Beam(
         signal=signal,
@@ -403,6 +408,7 @@ def _crossed(
                 "product and foreign object",
                 received=" behind ".join(str(layer) for layer in layers),
                 expected=f"slabs that let some photons through at {kV:g} kV",
+                remedy="take thinner slabs or a higher tube voltage",
             )
         return rate, gain
 

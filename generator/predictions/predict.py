@@ -17,7 +17,7 @@ from ..line.binning import binned_pixel
 from ..line.line_limits import check_count_rate, check_limits
 from ..line.measured_flats import USUAL_STRAY, measured_flats, stray_of_flats, stray_of_noise
 from ..line.spectral_signal import OpenBeam
-from ..line.twin import Estimate, Level, SpectralPosterior, Twin, estimate_from_log_draws, estimate_from_sd
+from ..line.twin import Z95, Estimate, Level, SpectralPosterior, Twin, estimate_from_log_draws, estimate_from_sd
 from ..line.twin_spectrum import slope_over_gain, slope_share, spectral_model_of
 
 if TYPE_CHECKING:
@@ -194,11 +194,11 @@ def _restored_sd(twin: Twin) -> float:
     if excess:
         return math.sqrt(max(float(np.median(excess)), 0.0))
     ends = [spread.variance_share for spread in twin.noise.spread.ends()]
-    return abs(ends[0] - ends[1]) / (2 * 1.959964) / slope_share(twin)
+    return abs(ends[0] - ends[1]) / (2 * Z95) / slope_share(twin)
 
 
 def _relative_sd(estimate: Estimate) -> float:
-    return (estimate.high - estimate.low) / (2 * 1.959964) / estimate.value
+    return estimate.sd / estimate.value
 
 
 def _estimate_from_draws(draws: NDArray[np.float64], relative_sd: float) -> Estimate:
@@ -397,7 +397,10 @@ def _by_model(
     # fewer than one photon in 1e30 is no beam, whatever floating point can still hold
     if not (np.all(signal.absorbed_per_mAs > 0) and left[0] > 1e-30 * bare[0]):
         raise InputError(
-            "filter", received=text_from_filters(setting.filters), expected="layers that let some photons through"
+            "filter",
+            received=text_from_filters(setting.filters),
+            expected="layers that let some photons through",
+            remedy="take thinner filters or a higher tube voltage",
         )
     factor = (1000.0 / distance_mm) ** 2 * (twin.instrument.pixel_mm or 1.0) ** 2
     rate_draws = signal.rate_DN_per_mAs * load_mAs * factor
@@ -435,7 +438,7 @@ def _as_measured(
     """The flatfield with what was measured at this kV and filter in place of the model's; None: its load is not known."""
     if level.rate_DN_per_mAs is not None:
         rate = level.rate_DN_per_mAs
-        relative = math.hypot((rate.high - rate.low) / (2 * 1.959964) / rate.value, stray_of_flats(twin))
+        relative = math.hypot(rate.sd / rate.value, stray_of_flats(twin))
         value = rate.value * load_mAs * ((level.source_detector_mm or distance_mm) / distance_mm) ** 2
         mean_DN, gain_DN = estimate_from_sd(value, relative * value), level.gain_DN
         outside = _outside(twin, setting, mean_DN.value)
@@ -477,9 +480,9 @@ def _of_frames(twin: Twin, setting: Setting, flat: _Flat, warnings: list[str]) -
     variance_draws = np.maximum(quantum_DN2, 0.0) + max(read_DN2, 1e-12) + common_DN2
     variance = float(np.median(variance_draws))
     of_quanta = max(variance - read_DN2 - common_DN2, 0.0) * flat.quantum_sd
-    of_reading = 2.0 * read.value * (read.high - read.low) / (2 * 1.959964) * binned.electronic
+    of_reading = 2.0 * read.value * (read.high - read.low) / (2 * Z95) * binned.electronic
     # cut at 0, so that its upper end alone has the full width
-    of_common = (common.high - common.value) / 1.959964 * mean_DN.value**2
+    of_common = (common.high - common.value) / Z95 * mean_DN.value**2
     of_series = stray_of_noise(twin) * variance
     relative_sd = 0.5 * math.hypot(of_quanta, of_reading, of_common, of_series) / variance
     saturated = saturation_text(twin, setting, mean_DN.value)
@@ -525,5 +528,5 @@ def saturation_text(twin: Twin, setting: Setting, mean_DN: float) -> str:
 
 def _log_sd(estimate: Estimate) -> float:
     if estimate.low <= 0:
-        return (estimate.high - estimate.low) / (2 * 1.959964) / max(abs(estimate.value), 1e-300)
-    return math.log(estimate.high / estimate.low) / (2 * 1.959964)
+        return estimate.sd / max(abs(estimate.value), 1e-300)
+    return math.log(estimate.high / estimate.low) / (2 * Z95)

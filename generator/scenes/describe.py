@@ -156,7 +156,9 @@ def read_description(path: str | os.PathLike[str]) -> Description:
         text = read_utf8(file)
         tables = tomllib.loads(text)
     except FileNotFoundError:
-        raise FileFormatError(str(path), received="no such file", expected="a description (TOML)") from None
+        raise FileFormatError(
+            str(path), received="no such file", expected="a description (TOML)", remedy="check the path"
+        ) from None
     except (OSError, tomllib.TOMLDecodeError) as error:
         raise FileFormatError(
             str(path), received=f"text that is not TOML ({error})", expected="a description"

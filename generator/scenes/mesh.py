@@ -53,6 +53,7 @@ class Mesh:
                 "mesh",
                 received=f"a radius of {self.radius_mm:.3g} mm",
                 expected=f"less than {rays.source_mm:g} mm, the source",
+                remedy="state scale_mm, the mm of one unit of the file",
             )
         total = np.zeros(rays.shape)
         add_lengths(corners, rays.source_mm, rays.x_mm[0].copy(), rays.y_mm[:, 0].copy(), total)

@@ -5,7 +5,6 @@ mAs and mm2 at 1 m) and R(E) the signal of a photon (DN), the open signal of a s
 """
 
 import csv
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,9 +16,8 @@ from numpy.typing import NDArray
 
 from ...acquisition.setting import Setting, text_from_filters
 from ...errors import InputError
-from ...files import whole_file
+from ...files import whole_file, write_json
 from ...materials import material_from_name, mu_per_mm
-from ...results import plain
 from ..line.spectral_signal import OpenBeam
 from ..line.twin import BAD_PIXEL_MAP, SpectralPosterior, Twin
 from ..line.twin_spectrum import spectral_model_of

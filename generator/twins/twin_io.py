@@ -231,13 +231,18 @@ def read_any_twin(path: str | os.PathLike[str]) -> Twin | TubeTwin:
     from ...acquisition._hdf5 import HDF5_ERRORS, open_hdf5
 
     if not os.path.isfile(path):
-        raise FileFormatError("twin", received=path, expected="an existing file that `raytwin calibrate` wrote")
+        raise FileFormatError(
+            "twin", received=path, expected="an existing file that `raytwin calibrate` wrote", remedy="check the path"
+        )
     with open_hdf5(path, what="a twin file that `raytwin calibrate` wrote") as file, bounded(_READING_S):
         try:
             found = (_text(file.attrs.get("format", "no format")), int(file.attrs.get("version", 0)))
             if found != (FORMAT, VERSION):
                 raise FileFormatError(
-                    f"twin {path}", received=f"{found[0]} version {found[1]}", expected=f"{FORMAT} version {VERSION}"
+                    f"twin {path}",
+                    received=f"{found[0]} version {found[1]}",
+                    expected=f"{FORMAT} version {VERSION}",
+                    remedy="calibrate again with this raytwin",
                 )
             if _text(file.attrs.get("part", "")) == TUBE:
                 return _tube_from_file(file, path)

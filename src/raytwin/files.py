@@ -2,12 +2,14 @@
 
 import codecs
 import hashlib
+import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from .errors import FileFormatError, InputError
 
@@ -168,6 +170,18 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, final)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_json(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
+    """Write a JSON object for people to read, whole or not at all; what has no value (NaN) is null.
+
+    Raises:
+        InputError: `path` is a folder, or lies where nothing can be written.
+    """
+    from .results import plain  # numpy, which the command line's help does without
+
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def sha256_of_file(path: str | os.PathLike[str]) -> str:

@@ -710,7 +710,7 @@ def _fresh(
     warnings += source.warnings
 
     def images(number: int, epoch: int) -> "NDArray[np.float32]":
-        return source.example(number, epoch=epoch).log_images
+        return source.log_images(number, epoch=epoch)
 
     return images, {"twin_sha256": twin_sha256(twin), "low": str(pair[0]), "high": str(pair[1])}
 

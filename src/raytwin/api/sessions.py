@@ -1,6 +1,5 @@
 """Sessions: measured in the virtual lab, checked, and diagnosed."""
 
-import json
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields, replace
@@ -8,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
+from ..files import write_json
 from ..results import Result, Table, axes_or_new, frame, plain
 from ._folder import check_effects, written_folder
 from ._given import (
@@ -280,14 +280,6 @@ def diagnose(
                 )
                 _write(found, folder)
     return found
-
-
-def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write a JSON object, whole or not at all."""
-    from ..files import whole_file
-
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _write(found: "Diagnosis", folder: Path) -> None:

@@ -6,7 +6,6 @@ cases.csv and report.html into the folder; a run that was stopped goes on where 
 """
 
 import argparse
-import json
 import signal
 import sys
 import threading
@@ -14,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from ..api._folder import check_effects, written_folder
-from ..results import plain
 from ._answer import answer, say
 
 EXAMPLE = """examples:
@@ -94,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ..campaign.blind_report import summary_text, write_report
     from ..campaign.blind_results import case_rows, score_check, write_cases
     from ..errors import InputError
-    from ..files import whole_file
+    from ..files import write_json
     from ..generator.effects import EFFECTS
 
     check_effects("--without", arguments.without, tuple(EFFECTS))
@@ -151,8 +149,7 @@ def run(arguments: argparse.Namespace) -> int:
     result = score_check(check)
     rows = case_rows(check, result.outcomes)
     write_cases(folder / "cases.csv", rows)
-    with whole_file(folder / "scores.json") as temporary:
-        temporary.write_text(json.dumps(plain(result.scores), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_json(folder / "scores.json", result.scores)
     write_report(result, rows, folder / "report.html", version=__version__)
     answer(
         result.scores,

@@ -37,12 +37,11 @@ class SeenSize:
     """What observers find at a state.
 
     Fields: a90_mm (diameter in the object's plane that the ideal observer finds in 90 % of cases; None: none of those asked for);
-    smallest_mm, largest_mm (asked for); pod (of the disc that is shown; None outside these); false_alarm_rate (of the ideal
+    largest_mm (asked for); pod (of the disc that is shown; None outside these); false_alarm_rate (of the ideal
     observer); networks (a90 of networks, of the calibrated observer's size; None without one); size_name (of it).
     """
 
     a90_mm: float | None
-    smallest_mm: float
     largest_mm: float
     pod: float | None
     false_alarm_rate: float
@@ -153,7 +152,6 @@ class Eye:
             networks = Estimate(value=ends[0], low=ends[1], high=ends[2]) if _all_finite(ends) else None
         return SeenSize(
             a90_mm=a90 if math.isfinite(a90) else None,
-            smallest_mm=sizes[0],
             largest_mm=sizes[-1],
             pod=pod,
             false_alarm_rate=self._observer.false_alarm_rate,

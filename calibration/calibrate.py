@@ -121,6 +121,7 @@ def calibrate_twin(
                         " left out of the spectral fit; a larger gap behind a wedge lowers its scatter"
                     )
         except FitError as error:
+            evidence["no_spectrum"] = str(error)
             warnings.append(f"no spectral part: {error}")
         else:
             spectral = fit.posterior

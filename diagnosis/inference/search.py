@@ -108,7 +108,7 @@ class _Search:
         in_proportion = len(EFFECTS[like.effect].grid.shares) == 1
         self._nodes = (_ITSELF,) if in_proportion else (_NEAR, _UP_TO)
         # laws that may be off hold a fit back along what two parameters explain alike, so a step that helps may go further; but
-        # where the law's shape is what is off it leads away (0.4 % of lag read 0.37 so, 0.39 without; scatter 2 % lower)
+        # where the law's shape is what is off it leads away
         self._shares = (1.0, 0.3, 0.1) if in_proportion else (1.0, _FURTHER, 0.3, 0.1)
 
     def run(
@@ -167,10 +167,7 @@ class _Search:
 
 
 def _in_turn(inner: Sequence[Parameter]) -> list[Sequence[Parameter]]:
-    """Parameters that are sought together, one set after the other: reach before shape, which can stand for it far off.
-
-    With both from the start a veiling glare of 4 % was found as 2.4 % of another shape, with 130 less of log evidence.
-    """
+    """Parameters that are sought together, one set after the other: reach before shape, which can stand for it far off."""
     plain = [item for item in inner if not item.sought_last]
     turns = [plain, inner] if len(plain) < len(inner) else [inner]
     return [part for part in turns if part]
@@ -224,7 +221,7 @@ def slopes_of(curve: Curve, inner: Sequence[Parameter], strength: float, seen: F
 
 def from_middle(item: Parameter, value: float) -> float:
     """How far a parameter's value lies from the middle of its range, in halves of it; a direction has no middle."""
-    if _turns(item):
+    if item.goes_round:
         return 0.0
     return _way(item, math.sqrt(item.low * item.high) if item.log else 0.5 * (item.low + item.high), value)
 
@@ -261,7 +258,7 @@ def _room(variant: Variant, names: Sequence[str]) -> NDArray[np.float64]:
     room: NDArray[np.float64] = np.full((2, 1 + len(names)), np.inf)
     room[0] *= -1.0
     for item in EFFECTS[variant.effect].parameters:
-        if item.name in names and not _turns(item):
+        if item.name in names and not item.goes_round:
             value = variant.parameters[item.name]
             room[:, 1 + names.index(item.name)] = _way(item, value, item.low), _way(item, value, item.high)
     return room
@@ -279,16 +276,11 @@ def _within(normal: NDArray[np.float64], wanted: NDArray[np.float64], room: NDAr
     return np.asarray(lsq_linear(root, root @ solved, bounds=bounds, method="bvls").x)
 
 
-def _turns(item: Parameter) -> bool:
-    """Whether a parameter is a direction of all round."""
-    return item.name.endswith("_deg") and item.high - item.low >= 360.0
-
-
 def _way(item: Parameter, value: float, moved: float) -> float:
     """The step that moves a parameter's value so far, in halves of its range."""
     if item.log:
         return 2.0 * math.log(moved / value) / math.log(item.high / item.low)
-    if _turns(item):
+    if item.goes_round:
         return ((moved - value + 180.0) % 360.0 - 180.0) / 180.0
     return 2.0 * (moved - value) / (item.high - item.low)
 
@@ -297,7 +289,7 @@ def _moved(item: Parameter, value: float, step: float) -> float:
     """A parameter's value moved by `step` times half of its range, within the range."""
     if item.log:
         moved = value * math.exp(step * math.log(item.high / item.low) / 2.0)
-    elif _turns(item):
+    elif item.goes_round:
         return (value + 180.0 * step) % 360.0
     else:
         moved = value + step * (item.high - item.low) / 2.0

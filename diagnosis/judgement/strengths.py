@@ -162,7 +162,7 @@ def strengths_on(
     strengths = {effect: leading.strengths[effect][0] for effect in effects}
     if not effects:
         return strengths
-    # in the probes as they are: whitened ones gave a heel of 5 % a strength on half of a session that left three times the gap
+    # in the probes as they are: nuisances of the other half, taken out by whitening, would take a part of a smooth effect along
     had = [point.curve.effect for point in problem.given]
     part = Observed(
         residual=problem.residual_without(had)[fit],

@@ -268,7 +268,7 @@ def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
             values = [0.0, 1.0]  # a share: none or all
         else:
             span = item.high - item.low
-            count = 4 if item.name.endswith("_deg") else 2
+            count = 4 if item.is_angle else 2
             values = (
                 [item.low + span * k / count for k in range(count)]
                 if count == 4

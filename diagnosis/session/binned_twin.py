@@ -25,7 +25,7 @@ def binned_twin(twin: Twin, factor: int) -> Twin:
     With n = factor: gain, photon-transfer slope and DN a keV are 1 / n^2 of a pixel's, the electronic variance too; the spread is the
     one that leaves the same share of the quantum variance in a square, quanta counted per square, which
     is how averaged frames calibrate where light spreads over less than a square: with light of any place in it, edges of squares
-    that an object cuts are drawn too sharp, and a panel of 760 x 956 without effect showed a tail (log evidence 37; so none).
+    that an object cuts are drawn too sharp, which looks like a tail that is not there.
     Squares with a bad pixel are bad. `evidence` stays that of the pixels.
 
     Args:

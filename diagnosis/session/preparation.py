@@ -246,7 +246,8 @@ def _without_spectrum(acquisition: AcquisitionFile, twin: Twin) -> tuple[Finding
     ]
     if twin.spectral is not None or not stated:
         return ()
-    reason = next((line for line in twin.warnings if line.startswith("no spectral part")), "no spectral part")
+    because = twin.evidence.get("no_spectrum")
+    reason = "no spectral part" if because is None else f"no spectral part: {because}"
     first, *others = stated
     return (Finding(code=FindingCode.SPECTRUM, series=first, others=tuple(others), values={"what": reason}),)
 

@@ -84,6 +84,16 @@ class Parameter:
         if self.log and not (self.low > 0 and not self.signed):
             raise InputError(f"parameter {self.name}", received=self.low, expected="above 0 and unsigned, for log")
 
+    @property
+    def is_angle(self) -> bool:
+        """Whether it is an angle."""
+        return self.unit == "deg"
+
+    @property
+    def goes_round(self) -> bool:
+        """Whether it is a direction of all round, whose ends meet."""
+        return self.is_angle and self.high - self.low >= 360.0
+
     def pixels_per_bin(self, side: int) -> float:
         """By what a number found in squares of side x side pixels is multiplied to be that of pixels."""
         share: float = float(side) ** abs(self.pixel_power)

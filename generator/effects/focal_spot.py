@@ -92,6 +92,4 @@ FOCAL_SPOT = Effect(
     grid=Grid(
         shares=(0.25, 0.5, 0.75, 1.0), variants=tuple({"aspect": aspect, "flatness": 0.3} for aspect in (0.707, 1.414))
     ),
-    # of 64 sealed sessions without effect six showed 4 to 8, edges being drawn no better; two panels without effect, in squares of
-    # pixels, 77 of a spot of 0.47 mm, one with a spot of 0.6 mm 107
 )

@@ -6,6 +6,7 @@ from typing import Any
 from ..diagnosis.report.report import Detection
 from ..reports import AFTER, BEFORE, MEASURED, Band, Chart, Line, Points, Rule, SortedTable
 from ..reports.chart import Shape
+from ..results import between_text
 
 
 def detection_of(task: Mapping[str, Any] | None) -> Detection | None:
@@ -26,11 +27,7 @@ def task_text(task: Mapping[str, Any]) -> str:
     unit = f" {task['unit']}" if task["unit"] else ""
 
     def told(name: str) -> str:
-        value, interval = task[name], task[f"{name}_95"]
-        if value is None:
-            return "none that the data support"
-        low, high = ("?" if end is None else f"{end:.3g}" for end in (interval["low"], interval["high"]))
-        return f"{value:.3g}{unit} ({low} to {high})"
+        return "none that the data support" if task[name] is None else _a90_text(task[name], task[f"{name}_95"], unit)
 
     what = "the size" if task["size"] == "size_mm" else "the contrast"
     start = f"In detection, {what} found in nine of ten cases (a90)"
@@ -108,9 +105,6 @@ def _rows(task: Mapping[str, Any]) -> SortedTable:
         "measured": "measured images",
     }
 
-    def shown(value: float | None) -> str:
-        return "none" if value is None else f"{value:.3g}"
-
     rows = []
     for name, curve in task["curves"].items():
         networks, _, images = name.partition("_on_")
@@ -120,9 +114,15 @@ def _rows(task: Mapping[str, Any]) -> SortedTable:
                 names[networks],
                 names[images],
                 f"{curve['n_hits']} of {curve['n']} ({curve['objects']} objects)",
-                f"{shown(curve['a90'])} ({shown(interval['low'])} to {shown(interval['high'])})",
+                "none" if curve["a90"] is None else _a90_text(curve["a90"], interval),
                 "" if alarms is None else f"{alarms['false_alarms']} of {alarms['n']}",
             )
         )
     header = ("networks learnt from", "tried on", "hits", "a90 (95 %)", "false alarms")
     return SortedTable(header=header, rows=tuple(rows), words=frozenset({0, 1}))
+
+
+def _a90_text(value: float, interval: Mapping[str, float | None], unit: str = "") -> str:
+    """An a90 with its interval, of which the data may give no end."""
+    low, high = (None if end is None else f"{end:.3g}" for end in (interval["low"], interval["high"]))
+    return f"{value:.3g}{unit} ({between_text(low, high)})"

@@ -183,6 +183,13 @@ def number_text(value: float | None, digits: int = 4) -> str:
     return "not known" if value is None else f"{value:.{digits}g}"
 
 
+def between_text(low: str | None, high: str | None) -> str:
+    """The ends of an interval for people, each already in words; None: an end that the data do not give."""
+    if low is None:
+        return "no interval" if high is None else f"up to {high}"
+    return f"{low} and more" if high is None else f"{low} to {high}"
+
+
 def interval_text(value: Mapping[str, Any] | None, digits: int = 4) -> tuple[str, str]:
     """A value and its interval for two columns of a table."""
     if value is None:
@@ -190,9 +197,8 @@ def interval_text(value: Mapping[str, Any] | None, digits: int = 4) -> tuple[str
     ends = (value.get("low"), value.get("high"))
     if all(end is None for end in ends):
         return number_text(value.get("value"), digits), ""
-    return number_text(value.get("value"), digits), " to ".join(
-        "?" if end is None else f"{end:.{digits}g}" for end in ends
-    )
+    low, high = (None if end is None else f"{end:.{digits}g}" for end in ends)
+    return number_text(value.get("value"), digits), between_text(low, high)
 
 
 def axes_or_new(ax: Any, *, size_inches: tuple[float, float] = (6.4, 4.4)) -> Any:

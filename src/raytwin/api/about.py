@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import FileFormatError, InputError
+from ..files import given_path
 from ..results import Result, Table, plain
 from ._folder import written_folder
 from ._given import PathLike, as_any_twin, as_twin, twin_path
@@ -220,7 +221,7 @@ def export(
     from ..acquisition import acquisition_io, dataset_io
     from ..acquisition._hdf5 import format_of_file
 
-    folder = Path(output)
+    folder = given_path(output, expected="a folder", argument="output")
     with ExitStack() as stack:
         opened: Any = source
         if isinstance(source, str | os.PathLike):

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
+from ..files import given_path
 from ..results import Result, Table, axes_or_new, frame, number_text, plain
 from ._folder import written_folder
 from ._given import PathLike
@@ -270,7 +271,11 @@ def sweep(
             raise InputError(name, received=value, expected="a whole number, 1 or more")
     if output is None and not plan_only:
         raise InputError("output", received="none", expected="a folder for the sweep, or plan_only=True")
-    known = campaign if isinstance(campaign, Campaign) else read_campaign(Path(campaign))
+    known = (
+        campaign
+        if isinstance(campaign, Campaign)
+        else read_campaign(given_path(campaign, expected="a campaign", argument="campaign"))
+    )
     with Telling(progress, unit="setting") as telling:
         if plan_only or output is None:
             return _plan(known, telling)
@@ -278,7 +283,7 @@ def sweep(
             from ..segmentation import choose_device
 
             choose_device(device)  # says at once how to install torch where it is missing
-        folder = Path(output)
+        folder = given_path(output, expected="a folder", argument="output")
         with written_folder(folder):
             return _work(
                 known,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ..errors import FileFormatError, InputError, check_whole
-from ..files import check_new_folder, check_not_read
+from ..files import check_new_folder, check_not_read, given_path
 from ..results import Result, Table, axes_or_new, counted, frame, plain
 from ._given import PathLike, as_twin, dataset_of, twin_sha256, whole_seed
 from ._progress import Progress, Telling
@@ -378,7 +378,8 @@ def generate(
         "twin_sha256": twin_sha256(twin),
     }
     with tempfile.TemporaryDirectory() as scratch, Telling(progress, unit="pair") as telling:
-        path = Path(scratch) / "pairs.h5" if output is None else Path(output)
+        scratch_path = Path(scratch) / "pairs.h5"
+        path = scratch_path if output is None else given_path(output, expected="a dataset file", argument="output")
         telling.begin("generating", n)
         description = _description_of(reference)
         if description is not None:
@@ -464,7 +465,7 @@ def _references(reference: Any, twin: "Twin", scratch: Path) -> "Iterator[Datase
     if isinstance(reference, AcquisitionFile):
         path = _longest_pairs(reference, twin, scratch)
     else:
-        path = Path(reference)
+        path = given_path(reference, expected="reference pairs, or a description", argument="reference")
         try:
             open_dataset(path).close()
         except FileFormatError:
@@ -592,6 +593,7 @@ def train(
     from ..campaign.ensemble import train_together
     from ..segmentation import choose_device, train_networks
 
+    folder = given_path(output, expected="a folder for the networks", argument="output")
     chosen = _recipe(
         recipe,
         start_from=start_from,
@@ -642,12 +644,10 @@ def train(
             "warn": warnings.append,
         }
         if workers == 1:
-            found = train_networks(images, output, **words, fresh=fresh, fresh_noise=decided_by, network=network)
+            found = train_networks(images, folder, **words, fresh=fresh, fresh_noise=decided_by, network=network)
         else:
-            found = train_together(images, output, **words, workers=workers, threads=1 if threads is None else threads)
-    return TrainedNetworks(
-        path=Path(output), recipe=chosen, device=where, networks=tuple(found), warnings=tuple(warnings)
-    )
+            found = train_together(images, folder, **words, workers=workers, threads=1 if threads is None else threads)
+    return TrainedNetworks(path=folder, recipe=chosen, device=where, networks=tuple(found), warnings=tuple(warnings))
 
 
 def _own_recipe(recipe: "Recipe", *, architecture: str | None, encoder: str | None, workers: int) -> "Recipe":

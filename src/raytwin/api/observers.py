@@ -2,13 +2,13 @@
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..acquisition.setting import Filter, Setting, filter_from_text, setting_from_text
 from ..errors import InputError
+from ..files import given_path
 from ..results import Result, Table, axes_or_new, frame, interval_text, number_text, plain
 from ._given import PathLike, as_twin, dataset_of
 
@@ -311,7 +311,7 @@ def calibrate_observer(
 
     from ..observers import LineImages, MeasuredSize, Observer, fit_efficiency
 
-    folder = Path(sweep)
+    folder = given_path(sweep, expected="the folder of a sweep", argument="sweep")
     try:
         answer = json.loads((folder / "sweep.json").read_text(encoding="utf-8"))
         rows = [row for row in answer["rows"] if row["a90"] is not None]
@@ -404,7 +404,7 @@ def _outside(line: "LineImages", pairs: "Sequence[tuple[Setting, Setting]]") -> 
 def _pairs(settings: Any) -> list[tuple[Setting, Setting]]:
     from ..generator.predictions.predict_settings import as_setting
 
-    given = list(settings)
+    given = list(settings) if isinstance(settings, Iterable) else []
     if len(given) == 2 and all(isinstance(one, str | Setting) for one in given):
         given = [tuple(given)]
     if not given or not all(isinstance(one, tuple | list) and len(one) == 2 for one in given):

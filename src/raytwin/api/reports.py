@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import FileFormatError, InputError
+from ..files import given_path
 from ._given import PathLike, as_any_twin, dataset_of
 from .curves import PodCurve, fit_pod, is_response
 from .images import GeneratedPairs
@@ -68,7 +69,7 @@ def checked_page(output: PathLike, *, argument: str = "output") -> Path:
     Raises:
         InputError: another ending than .html.
     """
-    path = Path(output)
+    path = given_path(output, expected="a page", argument=argument)
     if path.suffix.lower() not in (".html", ".htm"):
         raise InputError(argument, received=path.name, expected="a name that ends in .html")
     return path

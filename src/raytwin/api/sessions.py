@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from ..files import write_json
+from ..files import given_path, write_json
 from ..results import Result, Table, axes_or_new, frame, plain
 from ._folder import check_effects, written_folder
 from ._given import (
@@ -248,7 +248,7 @@ def diagnose(
         raise InputError(
             "task", received="no folder for it", expected="an output folder, which keeps images and networks"
         )
-    folder = None if output is None else Path(output)
+    folder = None if output is None else given_path(output, expected="a folder", argument="output")
     place: AbstractContextManager[Any] = nullcontext() if folder is None else written_folder(folder)
     with place, Telling(progress) as telling:
         asked = (
@@ -310,7 +310,9 @@ def _task(task: Mapping[str, Any], *, seed: int, device: str) -> "tuple[TaskInpu
     settings = {side: as_setting(words.pop(side)) for side in ("low", "high") if side in words}
     products = words.pop("products", None)
     brought = TaskInput(
-        measured=Path(words.pop("measured")), products=None if products is None else Path(products), **settings
+        measured=given_path(words.pop("measured"), expected="measured images", argument="measured"),
+        products=None if products is None else given_path(products, expected="products", argument="products"),
+        **settings,
     )
     plan = TaskPlan(**words, seed=seed)
     check_task(brought)

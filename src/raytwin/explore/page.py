@@ -14,7 +14,7 @@ from ..acquisition.setting import Filter, filters_from_text
 from ..errors import InputError, RaytwinError
 from ..generator.line.twin import Estimate
 from ..materials import library_from_files, material_from_name
-from ..results import same_value
+from ..results import between_text, same_value
 from .seen_size import SeenSize
 from .state import ExplorerState, first_state
 from .view import BeamView, Explorer, ExplorerView, MapView
@@ -25,6 +25,7 @@ FILTER_MATERIALS = ("Al", "Cu", "Sn", "Ag", "Mo", "Ti", "Fe", "Pb")
 _NO_FILTER = "no filter"
 _THICK_MM = {"Al": 10.0, "Ti": 5.0}  # longest filter of a material; others
 _USUAL_MM = 2.0
+_NEXT_TO_NONE = 1e-5  # a POD below it is shown as 0
 _QUIET_MS = 250  # without a move before the map is drawn anew
 _RED = "#b00020"
 _CURVES = {
@@ -542,15 +543,15 @@ def _share(beam: BeamView) -> str:
 def _a90_text(known: Any) -> str:
     if known.a90 is None:
         return "none: the data support no a90"
-    ends = [("?" if end is None else _number(end, 3)) for end in (known.a90_low, known.a90_high)]
-    return f'{_number(known.a90, 3)} <span class="i">({ends[0]} to {ends[1]})</span>'
+    low, high = (None if end is None else _number(end, 3) for end in (known.a90_low, known.a90_high))
+    return f'{_number(known.a90, 3)} <span class="i">({between_text(low, high)})</span>'
 
 
 def _seen_size_rows(seen: SeenSize) -> list[tuple[str, str]]:
     """What model observers find, as titles and texts."""
     diameter = f"none up to {seen.largest_mm:.3g} mm" if seen.a90_mm is None else f"{seen.a90_mm:.3g} mm across"
     if seen.pod is not None:
-        diameter += f"; POD of the disc shown {100 * seen.pod:.3g} %"
+        diameter += f"; POD of the disc shown {100 * seen.pod if seen.pod > _NEXT_TO_NONE else 0:.3g} %"
     rows = [(f"a90 of an ideal observer, {100 * seen.false_alarm_rate:g} % false alarms", diameter)]
     if seen.size_name:
         unit = "" if seen.size_name == "contrast" else " mm"
@@ -565,8 +566,8 @@ def _seen_size_rows(seen: SeenSize) -> list[tuple[str, str]]:
 
 
 def _percents(pod: tuple[float, float, float]) -> str:
-    value, low, high = (100.0 * one for one in pod)
-    return f"{value:.3g} % ({low:.3g} to {high:.3g} %)"
+    value, low, high = (f"{100.0 * one:.3g}" if one > _NEXT_TO_NONE else "0" for one in pod)
+    return f"{value} % ({low} to {high} %)"
 
 
 def _note(text: str) -> str:

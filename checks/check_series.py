@@ -25,6 +25,7 @@ from .labels import check_labels
 from .loads_and_clocks import clock_findings, load_findings
 from .series_scan import SeriesScan, scan_series
 
+_AS_BRIGHT = 0.9  # of the highest value, in the middle of the neighbours of a pixel that light has saturated
 _JUMP = 0.03  # of the signal from one frame to the next: the largest plausible rms of a tube's output
 _EVEN = 3e-3  # pixels of raw flats respond less alike than this (rms): panels by 0.5 % and more, a CCD under even light by 0.43 %
 _HOW = {
@@ -217,12 +218,19 @@ def _series_findings(
 
 
 def _lifted_by_light(values: NDArray[Any], unlit: NDArray[Any] | None) -> NDArray[Any]:
-    """Values (frame, pixel) of the pixels that do not stand at the highest value without light too: those are stuck."""
+    """Values (frame, pixel) without pixels that are stuck at the highest value: without light too, or among dimmer neighbours.
+
+    Light spreads and fills areas: what it saturates has neighbours that are nearly as bright.
+    """
+    from scipy.ndimage import median_filter
+
     flat = values.reshape(len(values), -1)
-    if unlit is None:
-        return flat
-    free = unlit.ravel() < flat.max(initial=0)
-    return flat[:, free] if free.any() else flat
+    top = flat.max(initial=0)
+    picture = values.mean(axis=0)
+    stuck = (picture >= top) & (median_filter(picture, size=3, mode="nearest") < _AS_BRIGHT * top)
+    if unlit is not None:
+        stuck |= unlit >= top
+    return flat if stuck.all() else flat[:, ~stuck.ravel()]
 
 
 def _level_jump(scan: SeriesScan, offset_DN: float) -> tuple[int, float] | None:

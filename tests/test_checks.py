@@ -19,7 +19,9 @@ from raytwin import calibrate
 from raytwin.acquisition import open_acquisition
 from raytwin.checks import frame_signs
 from raytwin.checks.check import check_acquisition
+from raytwin.checks.check_series import _lifted_by_light
 from raytwin.checks.findings import Finding, FindingCode
+from raytwin.checks.frame_signs import pile_up_at_top
 from raytwin.cli import main
 from raytwin.errors import InputError
 from raytwin.generator.twins.twin_io import write_twin
@@ -104,6 +106,18 @@ def test_stuck_and_wildly_noisy_pixels_make_no_flat_saturated_and_no_scene_chang
     """Both show in the darks, and no panel is without them; a flat that saturates is told all the same."""
     found = [(finding.code, finding.series) for finding in check_acquisition(panel_of_bad_pixels).findings]
     assert found == [(FindingCode.SATURATED, broken.BRIGHT)]
+
+
+def test_pixels_that_stand_at_the_top_alone_are_stuck_and_areas_are_lit():
+    """Without a dark that shows them: they came up in the session."""
+    frames = 2600.0 + 30.0 * np.random.default_rng(4).standard_normal((6, 40, 50))
+    for row, column in ((5, 7), (20, 30), (39, 49)):
+        frames[:, row, column] = 13106.0
+    frames[:, 12, :] = 13106.0  # a line
+    assert pile_up_at_top(_lifted_by_light(np.rint(frames), None)) is None
+    frames[:, 25:31, 10:18] = 13106.0
+    top, share = pile_up_at_top(_lifted_by_light(np.rint(frames), None))
+    assert (top, share) == (13106.0, pytest.approx(48 / 2000, rel=0.1))
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from .held_out import Gap
 if TYPE_CHECKING:
     import pandas
 
+NO_GAP_FROM = 0.5  # probability of none from which that is likelier than all explanations together
 VERDICTS = ("no_gap", "explained", "explained_in_part", "ambiguous", "unknown_effect")
 EXPLAINED = ("explained", "explained_in_part")
 _LEFT_LISTED = 5
@@ -107,7 +108,7 @@ class Diagnosis(Result):
     @property
     def no_gap_but_findings(self) -> bool:
         """Whether the series that could be compared agree with the twin, and others contradict what they state."""
-        return bool(self.findings) and not self.hypotheses[0].effects
+        return bool(self.findings) and self.probability_no_gap >= NO_GAP_FROM
 
     @property
     def compared(self) -> Problem:

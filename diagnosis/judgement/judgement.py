@@ -24,7 +24,7 @@ from ..model.changes import Variant
 from ..model.curves import Curve
 from ..problem.known_effects import with_found
 from ..problem.problem import Problem
-from .answer import Cause, Diagnosis, Place
+from .answer import NO_GAP_FROM, Cause, Diagnosis, Place
 from .held_out import held_out
 from .strengths import applied_at_best, strength_of
 
@@ -236,11 +236,11 @@ def verdict_of(hypotheses: tuple[Hypothesis, ...]) -> Verdict:
     core = {effect for effect, value in _by_effect(hypotheses).items() if effect != UNKNOWN and value >= EXPLAINED_FROM}
     leading = next((item for item in hypotheses if core and set(item.effects) == core), hypotheses[0])
     tied: list[Hypothesis] = []
-    if not leading.effects:
+    if not leading.effects and leading.probability >= NO_GAP_FROM:
         word = "no_gap"
     elif leading.effects == (UNKNOWN,):
         word = "unknown_effect"
-    elif core == set(leading.effects):
+    elif core and core == set(leading.effects):
         word = "explained_in_part" if leading.misfit else "explained"
     else:
         word, total = "ambiguous", 0.0

@@ -63,7 +63,9 @@ def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[
     elif reading.sd is not None and curve.exact is not None and bool(curve.exact.any()):
         found = _outright(problem, hypothesis, effect)
     value, low, high = hypothesis.strengths[effect] if found is None else found
-    sd = reading.law_sd if found is None or reading.sd is None else reading.sd
+    # what the session shows the law to be off by, where that is more than usual
+    fitted_sd = max(reading.law_sd, hypothesis.levels.get(effect, 0.0))
+    sd = fitted_sd if found is None or reading.sd is None else reading.sd
     below, above = (math.hypot(math.log(one / value), Z95 * sd) for one in (low, high))
     return value, value * math.exp(-below), max(min(value * math.exp(above), curve.variant.most), value)
 

@@ -53,9 +53,9 @@ MAGNIFICATION_SD = 0.001
 # of the variance of edges' blur in all scenes: a third of a pixel's own, 1/12, as a thickness may be a pixel's mean or its middle's.
 # Assumed; with three times as much or a third four sessions had the same names (docs/notebook/diagnosis_designs.md)
 EDGE_SD_PX2 = 1.0 / 36.0
-# of the width of the declared focal spot along either side: from a point, as simulations may take it, to half as much again, as
-# IEC 60336 allows above the nominal value
-SPOT_SD = 0.5
+# of the width of the declared focal spot along either side: IEC 60336 allows half as much again above the nominal value, two
+# standard deviations; a point, as simulations may take it, has two of the image's variance less
+SPOT_SD = 0.25
 ROUGH_FIELDS = 24
 BEYOND_SD = 1.0  # beyond a border: 0 a picture that mirrors there, 1 one that goes on as it ends, 2 an edge that runs straight on
 ROUGH_SHARE = 0.9  # of the local slope: rendering along an edge, from place to place

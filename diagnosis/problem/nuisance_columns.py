@@ -64,7 +64,7 @@ def _of_its_own(model: ForwardModel, probes: SeriesProbes, signal: NDArray[np.fl
         dy, dx = gradient(signal)
         columns |= _of_thickness(probes, signal, redrawn.thicker, beams_differ)
         images |= _of_scene(item, dy, dx, sharp=model.sharp, rough=probes.rendered / RENDER_SHARE)
-        images |= _of_spot(declared_spot_px(model.base, item.request), dy, dx)
+        images |= _of_spot(declared_spot_px(model.base, item.request), signal)
         if model.sharp:
             images |= _between_points(item, signal)
         if redrawn.covered is not None:
@@ -263,16 +263,27 @@ def _of_scene(
     return images
 
 
-def _of_spot(sigma_px: float, dy: NDArray[np.float64], dx: NDArray[np.float64]) -> _Images:
+def _of_spot(sigma_px: float, signal: NDArray[np.float64]) -> _Images:
     """What another size of the focal spot than the instrument states does: blur that grows with the magnification.
 
-    sigma_px: of its image behind this scene; dy, dx: slopes of the signal (row, column), DN a pixel.
+    sigma_px: of its image behind this scene; signal: expected (row, column), DN.
     """
     if sigma_px == 0.0:
         return {}
-    (yy, _), (_, xx) = gradient(dy), gradient(dx)
-    half = scales.SPOT_SD * sigma_px**2  # of the change of variance, 2 SPOT_SD sigma^2
-    return {"size of the focal spot, columns": half * xx, "size of the focal spot, rows": half * yy}
+    more_px2 = 2.0 * scales.SPOT_SD * sigma_px**2
+    return {
+        "size of the focal spot, columns": _blurred_more(signal, more_px2, axis=1),
+        "size of the focal spot, rows": _blurred_more(signal, more_px2, axis=0),
+    }
+
+
+def _blurred_more(signal: NDArray[np.float64], variance_px2: float, *, axis: int) -> NDArray[np.float64]:
+    """What a Gaussian blur of this variance along an axis adds to a picture (row, column), which mirrors at its borders."""
+    from scipy.fft import dct, idct
+
+    frequency = np.arange(signal.shape[axis]) / (2.0 * signal.shape[axis])  # cycles a pixel
+    loss = np.expm1(-2.0 * math.pi**2 * variance_px2 * frequency**2)
+    return np.asarray(idct(dct(signal, axis=axis) * (loss if axis == 1 else loss[:, None]), axis=axis))
 
 
 def _between_points(item: SessionSeries, signal: NDArray[np.float64]) -> _Images:

@@ -92,7 +92,7 @@ def _signature_text(diagnosis: Diagnosis) -> str:
 
 def _where_text(places: Sequence[Place]) -> str:
     if not places:
-        return "No single probe stands out beyond noise and what calibration leaves open."
+        return "No single probe stands out beyond noise and what calibration leaves open; it shows in many together."
     axes = list(dict.fromkeys(axis_text(place.axis) for place in places[:12]))
     return f"The gap shows in {', '.join(axes[:3])}; most clearly in the {_place_text(places[0])}."
 
@@ -120,7 +120,10 @@ def strained_text(diagnosis: Diagnosis) -> str:
     shown = ", ".join(f"{name} ({value:+.0f} sd)" for name, value in diagnosis.strained[:_NAMED])
     more = len(diagnosis.strained) - _NAMED
     shown += f" and {more} more" if more > 0 else ""
-    return f"Pulled far from what is known of it: {shown}. Check these maps, labels and positions."
+    return (
+        f"Far from what is known of it: {shown}. A wrong map, label or position looks like that, and so may an effect that is not in"
+        " the catalogue."
+    )
 
 
 def paragraph(diagnosis: Diagnosis) -> str:
@@ -163,7 +166,7 @@ def verdict_text(diagnosis: Diagnosis) -> str:
         )
     if diagnosis.verdict == "ambiguous":
         named = ", ".join(f"{title} ({probability:.2f})" for title, probability in rivals(diagnosis))
-        text = f"{where} These data cannot distinguish what causes it: {named}. {figures}."
+        text = f"{where} These data cannot distinguish between {named}. {figures}."
         if diagnosis.next_measurement:
             text += f" To distinguish them: {diagnosis.next_measurement['text']}."
         return text

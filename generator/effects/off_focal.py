@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ..line.line_state import FloatArray, LineContext, LineState, needed
-from .effect import Effect, Grid, Parameter, Shows, Variation
+from .effect import Effect, Grid, Parameter, Reading, Shows, Variation
 
 _NEAR_GAUSSIAN = (
     0.02  # so little below 0 the first order of peakedness is enough: the transfer is off by less than 3e-4
@@ -145,6 +145,7 @@ OFF_FOCAL = Effect(
     isolated_by="an opaque disc at two magnifications",
     shows=Shows(series=("object",), axis="sharpness", flats=False),
     absorbed="nothing",
+    reading=Reading(law_sd=0.36),  # share and width trade against each other: read a third low to twice too high
     variation=Variation(random="surroundings"),
     grid=Grid(
         shares=(0.8,),

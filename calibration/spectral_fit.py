@@ -1070,8 +1070,11 @@ def _resampled(weight: NDArray[np.float64], count: int, rng: np.random.Generator
 
 
 def _remembered(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
-    """Largest correlation, over dimensions, of where walkers (walker, dimension) are with where they were."""
-    first, second = before - before.mean(axis=0), after - after.mean(axis=0)
+    """Largest rank correlation, over dimensions, of where walkers (walker, dimension) are with where they were.
+
+    Ranks, so that one walker that stands still far off does not count for all.
+    """
+    first, second = (np.argsort(np.argsort(at, axis=0), axis=0) - 0.5 * (len(at) - 1) for at in (before, after))
     scale = np.sqrt(np.sum(first**2, axis=0) * np.sum(second**2, axis=0))
     return float(np.max(np.sum(first * second, axis=0) / np.maximum(scale, 1e-300)))
 

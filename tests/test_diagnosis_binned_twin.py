@@ -153,10 +153,11 @@ def test_another_day_of_a_large_panel_is_compared_in_squares_with_its_own_twin(t
     improved = read_twin(answer / "twin.h5")
     assert improved.maps.shape == (96, 96)
     assert improved.effects[0].parameters["strength"] == pytest.approx(6.0, rel=0.2)
-    # with what was found there is no gap, and without it the twin is said to have what is not there
+    # with what was found there is no gap, and on a day without it another strength of it explains that
     os.replace(answer / "twin.h5", tmp_path / "improved.h5")
     assert said("--twin", str(tmp_path / "improved.h5"))["verdict"] == "no_gap"
     assert main(["lab", "--family", "none", "-o", str(later), *words, "--session", "1"]) == 0
     found = said("--twin", str(tmp_path / "improved.h5"))
-    assert found["verdict"] == "unknown_effect"
+    assert (found["verdict"], found["causes"][0]["effect"]) == ("explained", "motion_blur")
+    assert found["causes"][0]["strength"]["value"] < 1.0
     assert any("the twin has motion_blur, and this session shows 0.0" in line for line in found["warnings"])

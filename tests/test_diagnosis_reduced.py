@@ -210,7 +210,7 @@ def test_images_divided_by_their_open_field_are_compared_alike_as_light_shares_a
         assert answer["verdict"] == "no_gap"
         # what divides out of such images cannot be judged by them
         assert {"output_drift", "filtration_error", "row_noise"} <= untested(answer)
-        assert "mtf_tail" not in untested(answer)
+        assert not {"focal_spot", "motion_blur", "misregistration", "object_scatter"} & untested(answer)
         answers.append(answer)
     first = answers[0]
     for other in answers[1:]:
@@ -378,7 +378,18 @@ def test_averaged_frames_of_darks_are_as_quiet_as_their_number_says(line, tmp_pa
 
 @pytest.mark.slow
 def test_session_without_kV_is_judged_by_levels_and_noise_alone(diagnosed):
-    code, answer, _ = diagnosed(without("kV"))
+    """Of one beam: flats of several voltages have gains of their own."""
+    code, _, lines = diagnosed(without("kV"))
+    assert code == 2
+    assert len(lines) == 1
+    assert "state the kV of every flat" in lines[0]
+
+    def of_one_beam(file):
+        for name in [name for name in file["series"] if "90kV" in name]:
+            del file["series"][name]
+        without("kV")(file)
+
+    code, answer, _ = diagnosed(of_one_beam)
     assert code == 0
     assert answer["verdict"] == "no_gap"
     assert {"kv_error", "filtration_error", "composition_error", "focal_spot"} <= untested(answer)
@@ -464,7 +475,7 @@ def test_a_wrong_label_is_said_first_and_the_other_series_are_judged(diagnosed, 
     assert code == 0
     assert answer["verdict"] == "unknown_effect"
     assert all(cause["probability"] < 0.1 for cause in answer["causes"])
-    assert answer["probability_no_gap"] > 0.8
+    assert answer["probability_no_gap"] > 0.5
     assert sum(item["probability"] for item in answer["hypotheses"]) == pytest.approx(1.0)
     assert set(answer["mislabelled"][0]["series"]) == {FLAT_40, FLAT_90}
     assert {one["code"] for one in answer["findings"]} == {"label_against_frames"}

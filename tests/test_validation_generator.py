@@ -62,12 +62,15 @@ def test_generated_frames_are_as_near_to_the_lab_s_as_the_lab_s_own_sessions(cla
     result = validation.run(0, validation.SHORT, network=True, output=None)
     rows = result["statistics"]
 
-    def mean_distance(kind, of=""):
-        return np.mean([row[kind]["distance"] for row in rows if row["statistic"].startswith(of)])
+    # edges of hundreds of frames show the hundredth of the light whose place flats leave open
+    edges = [row for row in rows if row["statistic"] == "edge profile"]
+    assert all(abs(row["told transmissions"]["error_percent"]) < 1.0 for row in edges)
+
+    def mean_distance(kind):
+        return np.mean([row[kind]["distance"] for row in rows if row not in edges])
 
     # four replicates of eight frames: the lab's own sessions come out at 1.0 to 1.3
     assert mean_distance("told transmissions") < 1.1 * mean_distance("lab again") + 0.1
-    assert mean_distance("told transmissions", "edge") < 1.3
     for row in rows:
         if not row["statistic"].startswith("histogram"):
             assert abs(row["from maps"]["error_percent"]) < 4.0, row

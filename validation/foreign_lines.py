@@ -473,8 +473,7 @@ def run_line(job: tuple[str, int, tuple[str, ...]]) -> dict[str, Any]:
     for name in protocols:
         rng = np.random.default_rng([seed, FAMILIES.index(family), ord(name)])
         twin = measured_twin(line, PROTOCOLS[name], rng)
-        # no limit is known of the kerma, which the output's prior decides
-        limits = np.column_stack([information_limit(twin, SETTINGS), np.full(len(SETTINGS), math.nan)])
+        limits = information_limit(twin, SETTINGS)
         row: dict[str, Any] = {"protocol": name, "chi_square": twin.evidence["chi_square"], "settings": []}
         for (kV, layers), truth, limit in zip(SETTINGS, truths, limits, strict=True):
             setting = Setting(kV=kV, current_mA=0.5, exposure_ms=20.0, filters=filters_from_text(layers))
@@ -489,9 +488,10 @@ def run_line(job: tuple[str, int, tuple[str, ...]]) -> dict[str, Any]:
                 {
                     quantity: [
                         *(math.log(one / exact[quantity]) for one in (estimate.value, estimate.low, estimate.high)),
-                        float(limit[QUANTITIES.index(quantity)]),
+                        # no limit is known of the kerma, which the output's prior decides
+                        float(limit[at]) if at < len(limit) else None,
                     ]
-                    for quantity in QUANTITIES
+                    for at, quantity in enumerate(QUANTITIES)
                     if (estimate := getattr(found, quantity)) is not None
                 }
             )
@@ -512,7 +512,8 @@ def summarise(results: list[dict[str, Any]], *, draws: int = 1000) -> list[dict[
                         for result in results
                         for row in result["rows"]
                         if row["protocol"] == protocol and family in ("all", result["family"])
-                    ]
+                    ],
+                    dtype=np.float64,  # None: not a number
                 )
                 if not len(values):
                     continue

@@ -28,8 +28,9 @@ from .pairs import Single, log_odds_of_leak, log_odds_of_leak_in, log_prior, wei
 from .unknown import LOG_DENSITY, ExtraVariance, Families, fit_extra_variance
 
 UNKNOWN = "unknown_effect"
-_WITH_MISFIT = 3  # effects, and pairs, the likeliest, whose misfit is looked at
-# the likeliest effects that are the first of a pair: with six the same are named (notebook, ablation)
+_WITH_MISFIT = 3  # effects, and pairs, the likeliest, whose misfit is looked at at least
+_NEAR = 10.0  # of log evidence: what lies so near to the likeliest is looked at as that is (one in 20,000 lies further)
+# the likeliest effects that are the first of a pair at least: with six the same are named (notebook, ablation)
 _PAIRS_FROM = 2
 
 
@@ -116,7 +117,7 @@ def _weighed(
     singles = _singles(fits)
     count = max(len(singles), of_catalogue, 1)
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
-    looked_at = _WITH_MISFIT if misfits else 0
+    near = [effect for effect in ranked if singles[effect].log_evidence > singles[ranked[0]].log_evidence - _NEAR]
     left = Misfits(observed, families)
     none = left.none
     nothing = left.no_effect(misfits)
@@ -127,7 +128,7 @@ def _weighed(
         single = singles[effect]
         found = _of_fits((effect,), {effect: single.best}, single.log_evidence)
         found = replace(found, strengths={effect: interval_of(single.fits)})
-        if effect in ranked[:looked_at]:
+        if misfits and effect in {*ranked[:_WITH_MISFIT], *near}:
             found = left.of_kind(found, [single.best])[0]
             alike.append(left.of_another(single))
         weighed.append((found, of_single))
@@ -137,9 +138,11 @@ def _weighed(
         weighed.append((replace(nothing, log_evidence=of_given), math.log(priors.none)))
     leaks: dict[str, Hypothesis] = {}
     of_pair = math.log(priors.pair / max(count * (count - 1) // 2, 1))
-    for number, pair in enumerate(weigh_pairs(observed, singles, leading=_PAIRS_FROM, beside=beside)):
+    pairs = weigh_pairs(observed, singles, leading=max(_PAIRS_FROM, len(near)), beside=beside)
+    least = max((pair.log_evidence for pair in pairs), default=0.0) - _NEAR
+    for number, pair in enumerate(pairs):
         found = _of_fits(pair.effects, pair.fits, pair.log_evidence)
-        if number < looked_at:
+        if misfits and (number < _WITH_MISFIT or pair.log_evidence > least):
             found, another = left.of_kind(found, list(pair.fits.values()))
             like_two.append(another)
         weighed.append((found, of_pair))

@@ -57,6 +57,8 @@ def weigh_pairs(
 ) -> list[Pair]:
     """The effects that explain most, so many as `leading` says, each with every other one: those that are likely at first sight.
 
+    Of each of them the pair with its best companion is among these.
+
     Args:
         observed: what is weighed.
         singles: all effects, by id.
@@ -89,9 +91,15 @@ def weigh_pairs(
             a, b = sorted((first, second))
             if (a, b) not in seen or start + gain > seen[a, b][0]:
                 seen[a, b] = start + gain, point, second
-    likely = sorted(seen.values(), key=lambda item: -item[0])[:_IN_FULL]
+    likely = sorted(seen.values(), key=lambda item: -item[0])
+    # each of the leading effects with its best companion: what one's law leaves is asked of all of them
+    companions: dict[str, tuple[float, Point, str]] = {}
+    for item in likely:
+        companions.setdefault(item[1].curve.effect, item)
+    taken = likely[:_IN_FULL]
+    taken += [item for item in companions.values() if not any(item is one for one in taken)]
     result = []
-    for _, point, other in likely:
+    for _, point, other in taken:
         first = point.curve.effect
         both = {first: curves(first, other), other: curves(other, first)}
         result.append(_settled(observed, singles[first].best, point, both, other))

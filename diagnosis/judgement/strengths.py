@@ -15,6 +15,7 @@ from ..inference.discrepancy import USUAL_LEVEL, only
 from ..inference.inference import Hypothesis
 from ..inference.nuisances import Nuisances
 from ..inference.observed import Observed
+from ..model.curves import Curve
 from ..problem.assemble import map_changes
 from ..problem.output_course import rms_about_mean
 from ..problem.problem import Problem, SeriesView
@@ -64,10 +65,19 @@ def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[
         found = _outright(problem, hypothesis, effect)
     value, low, high = hypothesis.strengths[effect] if found is None else found
     # what the session shows the law to be off by, where that is more than usual
-    fitted_sd = max(reading.law_sd, hypothesis.levels.get(effect, 0.0))
+    fitted_sd = max(reading.law_sd, _off_by(problem, curve, value, hypothesis.levels.get(effect, 0.0)))
     sd = fitted_sd if found is None or reading.sd is None else reading.sd
     below, above = (math.hypot(math.log(one / value), Z95 * sd) for one in (low, high))
     return value, value * math.exp(-below), max(min(value * math.exp(above), curve.variant.most), value)
+
+
+def _off_by(problem: Problem, curve: Curve, strength: float, level: float) -> float:
+    """Relative standard deviation of a strength whose law is off by one factor, of `level`, in each family of probes.
+
+    The strength is their mean, weighed by the squares of what they show: level / sqrt(n), n = (sum w)^2 / sum w^2.
+    """
+    weight = np.bincount(problem.families.of, weights=curve.response(strength) ** 2)
+    return level * math.sqrt(float(np.sum(weight**2))) / max(float(np.sum(weight)), 1e-300)
 
 
 def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:

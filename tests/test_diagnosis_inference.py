@@ -17,7 +17,7 @@ from raytwin.diagnosis.inference.curve_fits import (
 )
 from raytwin.diagnosis.inference.discrepancy import LEVELS, group_factors
 from raytwin.diagnosis.inference.in_series import in_some_series
-from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
+from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, Priors, _singles, weigh_hypotheses
 from raytwin.diagnosis.inference.inner_parameters import with_inner_open
 from raytwin.diagnosis.inference.nuisances import LocalNuisances, Nuisances, Whitening, local_columns
 from raytwin.diagnosis.inference.observed import Observed, Point
@@ -367,6 +367,25 @@ def test_how_well_a_strength_is_known_is_what_its_interval_says():
     # nothing but real laws widens it
     found = applied_at_best(Bare(conditions={}), exact, "veiling_glare")
     assert found.strength_sd == pytest.approx(EFFECTS["veiling_glare"].reading.law_sd, rel=1e-9)
+    # a law that is off by 40 % in each of two families of probes, which show as much
+    halves = Families(of=np.arange(PROBES) % 2, names=("a", "b"))
+    off = replace(exact, levels={"veiling_glare": 0.4})
+    found = applied_at_best(Bare(conditions={}, families=halves), off, "veiling_glare")
+    assert found.strength_sd == pytest.approx(0.4 / math.sqrt(2.0), rel=1e-9)
+
+
+def test_each_of_the_leading_effects_is_weighed_with_its_best_companion():
+    """Of three that show nearly alike the third has as good a one."""
+    rng = np.random.default_rng(6)
+    alike, other = rng.standard_normal(PROBES), rng.standard_normal(PROBES)
+    residual = 4.0 * alike + 3.0 * other
+    curves = [one_node(name, alike + 0.05 * rng.standard_normal(PROBES)) for name in "abc"]
+    curves += [one_node(name, other + 0.05 * rng.standard_normal(PROBES)) for name in "de"]
+    observed = seen(residual)
+    singles = _singles(fit_effects(observed, curves))
+    leading = sorted(singles, key=lambda effect: -singles[effect].log_evidence)[:3]
+    pairs = weigh_pairs(observed, singles, leading=3)
+    assert {*leading} <= {effect for pair in pairs for effect in pair.effects}
 
 
 def test_an_interval_covers_the_variants_that_are_as_likely():

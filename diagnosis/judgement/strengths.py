@@ -76,6 +76,8 @@ def _off_by(problem: Problem, curve: Curve, strength: float, level: float) -> fl
 
     The strength is their mean, weighed by the squares of what they show: level / sqrt(n), n = (sum w)^2 / sum w^2.
     """
+    if level == 0.0:
+        return 0.0
     weight = np.bincount(problem.families.of, weights=curve.response(strength) ** 2)
     return level * math.sqrt(float(np.sum(weight**2))) / max(float(np.sum(weight)), 1e-300)
 

@@ -1,6 +1,6 @@
 # make demo   the main job end to end, report in demo/report.html
 # make table  the paper's table, some hours, page in table/report.html
-# make test   the default test suite (some ten minutes on 2 cores)
+# make test   the default test suite (five to ten minutes on 2 cores)
 # make docs   the documentation site, tutorials executed, in docs/_build/html (extra `docs`)
 # make check  lint, types, import directions (fast)
 PYTHON ?= python3
@@ -68,6 +68,7 @@ test-page: $(READY)
 	$(BIN)/python -m pip install --quiet playwright
 	$(BIN)/python -m pytest -q -m browser tests/test_explore_page.py tests/test_reports.py tests/test_campaign_*.py
 
+# what takes minutes: some twenty on 2 cores
 test-slow: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow
 

@@ -129,8 +129,8 @@ def _usual(
 class Proposal:
     """What to measure to distinguish two explanations, in words, and their separation: as the session is, and with it.
 
-    Fields: what; series: its name, where one of the session is taken again; measured: new series, as an acquisition's attributes;
-    separation, separation_then, standard deviations.
+    Fields: what; separation, separation_then: standard deviations; series: name of the one of the session that is taken again, else
+    empty; measured: new series, as an acquisition's attributes, else none; name: of what is measured new.
     """
 
     what: str

@@ -12,6 +12,7 @@ LAYER_FIELDS = ("inherent_filtration", "scintillator", "detector_cover", "interl
 TEXT_FIELDS = ("anode", "detector", "belt_axis", "binning_adds")
 WHOLE_FIELDS = ("bits", "tdi_stages")
 BOOLEAN_FIELDS = ("counting", "readout_overlaps")
+HIGHEST_THRESHOLD_KEV = 80.0  # of counters: above, nothing is left of most beams
 MOST_BITS = 32  # of the numbers that detectors write
 _SAME_PITCH = 0.01  # relative: pitches are stated to so much
 
@@ -92,6 +93,12 @@ class Instrument:
                 "instrument maximum_counts_per_s",
                 received=f"{self.maximum_counts_per_s:g} counts/s for an integrating detector",
                 expected="no count limit, or counting = true",
+            )
+        if self.threshold_keV is not None and self.threshold_keV > HIGHEST_THRESHOLD_KEV:
+            raise InputError(
+                "instrument threshold_keV",
+                received=f"{self.threshold_keV:g} keV",
+                expected=f"0 to {HIGHEST_THRESHOLD_KEV:g} keV",
             )
         if self.threshold_keV is not None and self.counting is False:
             raise InputError(

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..acquisition.instrument import HIGHEST_THRESHOLD_KEV
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prior:
@@ -247,7 +249,7 @@ UNDECLARED_THRESHOLD = Prior(
     centre=10.0,
     sd=10.0,
     low=0.0,
-    high=60.0,
+    high=HIGHEST_THRESHOLD_KEV,
     reason="threshold not declared: above noise (4 keV in silicon, 10 in CdTe), 20 to 35 where two energies are counted",
 )
 COUNTING_SWANK = Prior(

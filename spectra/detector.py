@@ -188,7 +188,7 @@ def counted_fraction(
         (m, n), 0 to 1.
 
     Raises:
-        InputError: an unknown material.
+        InputError: an unknown material, or a layer without thickness.
 
     Example:
         >>> from raytwin.acquisition.setting import Filter
@@ -199,6 +199,8 @@ def counted_fraction(
     """
     from scipy.special import ndtr
 
+    if not layer.thickness_mm > 0:
+        raise InputError("layer", received=str(layer), expected="a thickness above 0 mm", remedy="for example CdTe:1")
     energies = np.asarray(energies_keV, dtype=float)
     thresholds = np.asarray(threshold_keV, dtype=float)[:, None]
     material = material_from_name(layer.material, library=library)

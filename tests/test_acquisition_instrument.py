@@ -6,6 +6,7 @@ import pytest
 from raytwin.acquisition import write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.cli import main
+from raytwin.errors import InputError
 from raytwin.generator.twins.twin_io import write_twin
 
 STATED = {"pixel_mm": 0.4, "bits": 14, "anode": "W", "counting": False}
@@ -48,3 +49,16 @@ def test_a_twin_of_another_line_is_refused(make_model_twin, tmp_path, capsys):
         assert "pixels of 0.4 mm" in said
         assert "expected the twin's: 0.45 mm" in said
     assert not (tmp_path / "answer").exists() or not list((tmp_path / "answer").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("stated", "line"),
+    [
+        ({"threshold_keV": 20.0, "counting": False}, "no threshold, or counting = true"),
+        ({"threshold_keV": 20000.0, "counting": True}, "got 20000 keV; expected 0 to 80 keV"),
+        ({"threshold_keV": -1.0, "counting": True}, "threshold_keV: got -1"),
+    ],
+)
+def test_a_threshold_is_a_counter_s_and_in_keV(stated, line):
+    with pytest.raises(InputError, match=line):
+        Instrument(**stated)

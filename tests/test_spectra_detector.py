@@ -165,3 +165,8 @@ def test_half_keV_bins_cost_less_than_a_tenth_of_a_percent(kV: float, scintillat
 def test_a_detector_without_a_sensitive_layer_is_refused(layers: str) -> None:
     with pytest.raises(InputError, match=r"scintillator: got .*; expected at least one layer of more than 0 mm"):
         detector_response(energies_keV=GRID, scintillator=filters_from_text(layers))
+
+
+def test_a_counter_s_layer_has_a_thickness() -> None:
+    with pytest.raises(InputError, match="a thickness above 0 mm"):
+        counted_fraction(energies_keV=[60.0], threshold_keV=[20.0], layer=Filter(material="CdTe", thickness_mm=0.0))

@@ -29,7 +29,7 @@ from .unknown import LOG_DENSITY, ExtraVariance, Families, fit_extra_variance
 
 UNKNOWN = "unknown_effect"
 _WITH_MISFIT = 3  # effects, and pairs, the likeliest, whose misfit is looked at at least
-_NEAR = 10.0  # of log evidence: what lies so near to the likeliest is looked at as that is (one in 20,000 lies further)
+_NEAR = 10.0  # of log evidence: what lies so near to the likeliest, odds of 22,000, is looked at as that is
 # the likeliest effects that are the first of a pair at least: with six the same are named (notebook, ablation)
 _PAIRS_FROM = 2
 

@@ -176,7 +176,7 @@ def strengths_on(
     strengths = {effect: leading.strengths[effect][0] for effect in effects}
     if not effects:
         return strengths
-    # in the probes as they are: nuisances of the other half, taken out by whitening, would take a part of a smooth effect along
+    # in the probes as they are: whitening is of the whole session, whose halves it mixes
     had = [point.curve.effect for point in problem.given]
     part = Observed(
         residual=problem.residual_without(had)[fit],

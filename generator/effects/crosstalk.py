@@ -101,6 +101,6 @@ CROSSTALK = Effect(
     isolated_by="an edge close to the detector, with the noise power of flats",
     shows=Shows(series=("object",), axis="sharpness", flats=False),
     absorbed="nothing",
-    reading=Reading(law_sd=0.36),  # share and reach trade against each other: read up to twice too high
+    reading=Reading(law_sd=0.36),  # share and reach trade against each other, as those of K fluorescence
     grid=Grid(shares=(0.8,), variants=({"reach_px": 0.7}, {"reach_px": 1.6})),
 )

@@ -112,6 +112,6 @@ K_FLUORESCENCE = Effect(
     shows=Shows(series=LIT_SERIES, axis="sharpness"),
     either_onset=True,
     absorbed="noise",
-    reading=Reading(law_sd=0.36),  # share and reach trade against each other, as those of crosstalk
+    reading=Reading(law_sd=0.36),  # a K photon's reach stands for how many there are: thirteen shares were off by 36 %
     grid=Grid(shares=(0.8,), variants=({"range_mm": 0.15}, {"range_mm": 0.33})),
 )

@@ -145,7 +145,7 @@ OFF_FOCAL = Effect(
     isolated_by="an opaque disc at two magnifications",
     shows=Shows(series=("object",), axis="sharpness", flats=False),
     absorbed="nothing",
-    reading=Reading(law_sd=0.36),  # share and width trade against each other: read a third low to twice too high
+    reading=Reading(law_sd=0.36),  # share and width trade against each other, as those of K fluorescence
     variation=Variation(random="surroundings"),
     grid=Grid(
         shares=(0.8,),

@@ -6,7 +6,8 @@ fraction D(E)):
     N(E)    = kappa Phi(E; kV (1 + e)) (kV / 60)^x (E / 50)^(h + u ln(kV / 60)) (2 - 2 E / kV)^s exp(-sum mu t) (1000 / d)^2 a^2
     signal  = gamma sum N c l m1    gain = (gamma / A_S) sum N c l^2 m2 (E / 50)^-w / sum N c l m1 + W    absorbed = sum N c D
 
-for energy-integrating detectors; a counting detector has m1 = m2 = D and l = 1. gamma is in DN per keV absorbed, s how much
+for energy-integrating detectors; a counting detector has m1 = m2 = D q and l = 1, with q the share of
+what is stopped that lies above its threshold (`spectra.counted_fraction`). gamma is in DN per keV absorbed, s how much
 steeper than SpekPy's a spectrum falls to its end point (E below 0.98 kV), e = kV_error + kV_tilt ln(kV / 60), and mu that of
 xraylib moved by shares of its differences to two other tables: mu (1 + c (Chantler / xraylib - 1) + p (PENELOPE / xraylib - 1)).
 The layers t are those in the beam, the inherent filtration, and micrometres of the anode's own metal (a rough or worn anode). A
@@ -27,6 +28,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ...acquisition.instrument import HIGHEST_THRESHOLD_KEV
 from ...acquisition.setting import Filter
 from ...errors import InputError
 from ...materials import material_from_name, mu_per_mm, transmission
@@ -78,7 +80,7 @@ _RESPONSE_OF_COUNTERS = ("cover_mm_C", "cover_mm_Al", "dead_layer_um")
 _OF_UNDECLARED_COVER = "cover_mm_Al"
 THRESHOLD = "threshold_keV"
 # thresholds of counters (node,), keV, between which the counted share is linear
-THRESHOLDS_KEV: NDArray[np.float64] = np.linspace(0.0, 80.0, 161)
+THRESHOLDS_KEV: NDArray[np.float64] = np.linspace(0.0, HIGHEST_THRESHOLD_KEV, 161)
 ALTERNATIVE_SCINTILLATOR = "scintillator_alternative"
 # of a tube whose kerma was measured: its output over the flux that the flats saw (fill factor, distances), logarithm
 KERMA_OUTPUT = "log_kerma_over_flats"

@@ -25,7 +25,7 @@ from .labels import check_labels
 from .loads_and_clocks import clock_findings, load_findings
 from .series_scan import SeriesScan, scan_series
 
-_AS_BRIGHT = 0.9  # of the highest value, in the middle of the neighbours of a pixel that light has saturated
+_AS_BRIGHT = 0.9  # of the highest value, median of the neighbours of a pixel that light has saturated; assumed
 _JUMP = 0.03  # of the signal from one frame to the next: the largest plausible rms of a tube's output
 _EVEN = 3e-3  # pixels of raw flats respond less alike than this (rms): panels by 0.5 % and more, a CCD under even light by 0.43 %
 _HOW = {

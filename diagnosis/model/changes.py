@@ -54,7 +54,7 @@ MAGNIFICATION_SD = 0.001
 # Assumed; with three times as much or a third four sessions had the same names (docs/notebook/diagnosis_designs.md)
 EDGE_SD_PX2 = 1.0 / 36.0
 # of the width of the declared focal spot along either side: IEC 60336 allows half as much again above the nominal value, two
-# standard deviations; a point, as simulations may take it, has two of the image's variance less
+# standard deviations; a point, as simulations may take it, lies two standard deviations of its image's variance below
 SPOT_SD = 0.25
 ROUGH_FIELDS = 24
 BEYOND_SD = 1.0  # beyond a border: 0 a picture that mirrors there, 1 one that goes on as it ends, 2 an edge that runs straight on

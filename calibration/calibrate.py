@@ -26,6 +26,7 @@ from .next_measurement import advice, voltages_within_reach
 from .output_table import OutputTable
 from .photon_transfer import PhotonTransfer, compute_photon_transfer
 from .priors import PRIORS
+from .setting_errors import allowing_for_settings
 from .spectral_fit import SpectralFit, Transmission, contradicts, fit_evidence, fit_spectrum, model_for, unlike_output
 from .transmission_table import TransmissionTable
 from .tube import DoseData, dose_data, fit_without_strays, table_evidence
@@ -94,10 +95,11 @@ def calibrate_twin(
         evidence["wedges"] = wedge_evidence(wedges)
         warnings += [f"wedge left out: {item.skipped}" for item in wedges if item.skipped]
         transmissions = [value for item in wedges for value in item.transmissions]
+        levels = allowing_for_settings(transfer.levels, transfer.points, transfer.evidence["setting_errors"])
 
         def fit_of(chosen: DoseData, behind: Sequence[Transmission] = transmissions) -> SpectralFit:
             return fit_spectrum(
-                transfer.levels,
+                levels,
                 acquisition.instrument,
                 rng=rng,
                 spectra=spectra,

@@ -56,6 +56,7 @@ class SeriesPoint:
             "filter": text_from_filters(self.filters),
             "exposure_ms": self.exposure_ms,
             "load_mAs": self.load_mAs,
+            "source_detector_mm": self.source_detector_mm,
             "frames": self.frames,
             "averaged": self.averaged,
             "signal_DN": self.signal_DN,

@@ -46,6 +46,7 @@ from .repeated_frames import (
     series_of_beams,
     warning_of,
 )
+from .setting_errors import setting_errors
 from .spread_fit import SpreadFit
 
 ESTIMATORS = ("pairs", "stack")
@@ -434,6 +435,9 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
     evidence, found = flat_evidence(points, noise, darks, good)
     warnings += found
     evidence["estimator"] = estimator
+    evidence["setting_errors"] = setting_errors(
+        [point for point in points if point.used], source_detector_mm=session.acquisition.instrument.source_detector_mm
+    )
     evidence["clusters"] = cluster_evidence(flats.bad)
     evidence["maps"] = {
         "gain_relative_sd": gain_sd,

@@ -5,8 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ...acquisition.setting import Setting
 from ...errors import InputError
-from .twin import Twin
+from .twin import Level, Twin
 
 USUAL_STRAY = 0.002  # relative, of a flat that is repeated
 
@@ -15,7 +19,8 @@ USUAL_STRAY = 0.002  # relative, of a flat that is repeated
 class MeasuredFlat:
     """A series of flats whose level and noise made the twin.
 
-    Fields: series: its name; signal_DN: median above dark, above 0; kV, exposure_ms, load_mAs of an exposure: None where unknown.
+    Fields: series: its name; signal_DN: median above dark, above 0; kV, exposure_ms, load_mAs of an exposure, source_detector_mm:
+    None where unknown.
     """
 
     series: str
@@ -23,6 +28,7 @@ class MeasuredFlat:
     kV: float | None
     exposure_ms: float | None
     load_mAs: float | None
+    source_detector_mm: float | None
 
 
 def measured_flats(twin: Twin) -> tuple[MeasuredFlat, ...]:
@@ -35,12 +41,7 @@ def measured_flats(twin: Twin) -> tuple[MeasuredFlat, ...]:
     try:
         found = [_flat(point) for point in points if point["used"]]
     except (TypeError, KeyError, ValueError, AttributeError):
-        raise InputError(
-            "evidence of the twin",
-            received="`photon_transfer` that cannot be read",
-            expected="a row for each flat with `series`, `used` and `signal_DN`",
-            remedy="calibrate again",
-        ) from None
+        raise _unreadable("photon_transfer", "a row for each flat with `series`, `used` and `signal_DN`") from None
     return tuple(flat for flat in found if flat.signal_DN > 0)
 
 
@@ -58,6 +59,53 @@ def stray_of_noise(twin: Twin) -> float:
     return _scatter(twin, "scatter_of_noise")
 
 
+def rate_changes(exposure_ms: float | None, source_detector_mm: float | None) -> NDArray[np.float64]:
+    """What 1 ms and 1 mm more than stated do to the logarithm of a level over its load (2,); 0 where unknown."""
+    return np.array(
+        [1.0 / exposure_ms if exposure_ms else 0.0, -2.0 / source_detector_mm if source_detector_mm else 0.0]
+    )
+
+
+def stray_of_rates(errors: Mapping[str, Any], change: NDArray[np.float64]) -> float:
+    """Relative standard deviation of a level over its load at one setting against another, from what times and distances are off.
+
+    errors: `setting_errors` of the evidence; change: `rate_changes` at the one less those at the other.
+    """
+    return math.sqrt(max(float(change @ np.asarray(errors["second_moments"], dtype=np.float64) @ change), 0.0))
+
+
+def stray_of_setting(twin: Twin, setting: Setting, level: Level | None, *, distance_mm: float) -> float:
+    """Relative standard deviation of a level at a setting, as its exposure and distance are not those of the calibrating flats.
+
+    Args:
+        twin: whose evidence says how far times and distances may be off; an older one's says nothing, which counts as 0.
+        setting: of the level.
+        level: the measured level of its beam, whose flats are compared with; None: all flats of the twin.
+        distance_mm: from the source to the detector at the setting.
+
+    Raises:
+        InputError: evidence that cannot be read.
+    """
+    errors = twin.evidence.get("setting_errors")
+    if errors is None:
+        return 0.0
+    flats = [flat for flat in measured_flats(twin) if flat.load_mAs and (level is None or flat.series in level.series)]
+    usual_mm = twin.instrument.source_detector_mm or distance_mm
+    known = [rate_changes(flat.exposure_ms, flat.source_detector_mm or usual_mm) for flat in flats]
+    if not known:
+        return 0.0
+    try:
+        return stray_of_rates(errors, rate_changes(setting.exposure_ms, distance_mm) - np.mean(known, axis=0))
+    except (TypeError, KeyError, ValueError):
+        raise _unreadable("setting_errors", "`second_moments` of 2 x 2 numbers") from None
+
+
+def _unreadable(name: str, expected: str) -> InputError:
+    return InputError(
+        "evidence of the twin", received=f"`{name}` that cannot be read", expected=expected, remedy="calibrate again"
+    )
+
+
 def _scatter(twin: Twin, name: str) -> float:
     """A scatter of the evidence; 0 where it has none.
 
@@ -69,12 +117,7 @@ def _scatter(twin: Twin, name: str) -> float:
         return 0.0
     value = found.get("relative_sd") if isinstance(found, Mapping) else found
     if not isinstance(value, int | float) or not 0.0 <= value < math.inf:
-        raise InputError(
-            "evidence of the twin",
-            received=f"`{name}` that cannot be read",
-            expected="a `relative_sd` of 0 or more",
-            remedy="calibrate again",
-        )
+        raise _unreadable(name, "a `relative_sd` of 0 or more")
     return float(value)
 
 
@@ -89,4 +132,5 @@ def _flat(point: Mapping[str, Any]) -> MeasuredFlat:
         kV=number("kV"),
         exposure_ms=number("exposure_ms"),
         load_mAs=number("load_mAs"),
+        source_detector_mm=number("source_detector_mm"),
     )

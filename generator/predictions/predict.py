@@ -15,7 +15,7 @@ from ...spectra import checked_kV
 from ..frames.present_line import PresentLine, present_line
 from ..line.binning import binned_pixel
 from ..line.line_limits import check_count_rate, check_limits
-from ..line.measured_flats import USUAL_STRAY, measured_flats, stray_of_flats, stray_of_noise
+from ..line.measured_flats import USUAL_STRAY, measured_flats, stray_of_flats, stray_of_noise, stray_of_setting
 from ..line.spectral_signal import OpenBeam
 from ..line.twin import Z95, Estimate, Level, SpectralPosterior, Twin, estimate_from_log_draws, estimate_from_sd
 from ..line.twin_spectrum import slope_over_gain, slope_share, spectral_model_of
@@ -408,7 +408,8 @@ def _by_model(
     # the draws hold what the parameters leave open; single levels stray from any such model, more so outside
     widen = math.sqrt(1.0 + len(outside))
     beyond_repeats = math.sqrt(max(stray_of_flats(twin) ** 2 - USUAL_STRAY**2, 0.0))
-    level_sd = math.hypot(widen * posterior.level_discrepancy, beyond_repeats)
+    of_setting = stray_of_setting(twin, setting, None, distance_mm=distance_mm)
+    level_sd = math.hypot(widen * posterior.level_discrepancy, beyond_repeats, of_setting)
     gain_sd = widen * posterior.gain_discrepancy
     share, restored_sd = slope_share(twin), _restored_sd(twin)
     # level and gain are known together, not one by one: their product draw by draw
@@ -426,7 +427,9 @@ def _by_model(
         photons=_estimate_from_draws(signal.absorbed_per_mAs * load_mAs * factor, math.hypot(level_sd, restored_sd)),
         kerma_uGy=_estimate_from_draws(
             signal.kerma_uGy_per_mAs * load_mAs * (1000.0 / at_object_mm) ** 2,
-            level_sd if posterior.kerma_discrepancy is None else widen * posterior.kerma_discrepancy,
+            level_sd
+            if posterior.kerma_discrepancy is None
+            else math.hypot(widen * posterior.kerma_discrepancy, of_setting),
         ),
         outside=outside,
     )
@@ -438,7 +441,8 @@ def _as_measured(
     """The flatfield with what was measured at this kV and filter in place of the model's; None: its load is not known."""
     if level.rate_DN_per_mAs is not None:
         rate = level.rate_DN_per_mAs
-        relative = math.hypot(rate.sd / rate.value, stray_of_flats(twin))
+        of_setting = stray_of_setting(twin, setting, level, distance_mm=distance_mm)
+        relative = math.hypot(rate.sd / rate.value, stray_of_flats(twin), of_setting)
         value = rate.value * load_mAs * ((level.source_detector_mm or distance_mm) / distance_mm) ** 2
         mean_DN, gain_DN = estimate_from_sd(value, relative * value), level.gain_DN
         outside = _outside(twin, setting, mean_DN.value)

@@ -1,0 +1,114 @@
+"""Exposures and distances that are not as stated: what flats tell of them, and how far predictions then reach."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from raytwin.acquisition import open_acquisition, write_acquisition
+from raytwin.acquisition.setting import Setting, filters_from_text
+from raytwin.calibration.calibrate import calibrate_twin
+from raytwin.calibration.flat_levels import SeriesPoint
+from raytwin.calibration.setting_errors import DISTANCE_SD, EXPOSURE_SD_MS, allowing_for_settings, setting_errors
+from raytwin.errors import InputError
+from raytwin.generator.line.measured_flats import stray_of_setting
+from raytwin.generator.line.twin import Z95
+from raytwin.generator.predictions.predict import predict_flatfield
+
+MM, COPPER = 1059.0, filters_from_text("Cu:0.05")
+
+
+def flat(number, *, kV=80.0, ms=100.0, mm=None, late_ms=0.0, near_mm=0.0):
+    """A flat of 1 mA whose light is as if its exposure were longer and its detector nearer."""
+    light = (ms + late_ms) * (MM / ((mm or MM) - near_mm)) ** 2
+    return SeriesPoint(
+        series=f"flat_{number}", kV=kV, filters=COPPER, exposure_ms=ms, load_mAs=ms / 1000.0, source_detector_mm=mm,
+        photons_per_pixel=None, frames=10, averaged=1, signal_DN=20.0 * light, mean_signal_DN=20.0 * light,
+        pair_variance_DN2=1.0, stack_variance_DN2=1.0, used=True, masked="", drift_percent=0.0, common_mode_percent=0.0,
+    )  # fmt: skip
+
+
+def half_width(estimate):
+    return (estimate.high - estimate.low) / 2.0 / estimate.value
+
+
+def test_flats_of_one_exposure_and_distance_leave_what_is_known_beforehand():
+    found = setting_errors([flat(0), flat(1, kV=40.0)], source_detector_mm=MM)
+    assert found["exposure_ms"] == {"value": 0.0, "sd": pytest.approx(EXPOSURE_SD_MS)}
+    assert found["distance_mm"] == {"value": 0.0, "sd": pytest.approx(DISTANCE_SD * MM)}
+    # beams have levels of their own: another voltage at another exposure tells nothing
+    assert setting_errors([flat(0), flat(1, kV=40.0, ms=20.0)], source_detector_mm=MM)["exposure_ms"]["value"] == 0.0
+    assert setting_errors([dataclasses.replace(flat(0), load_mAs=None)], source_detector_mm=MM) is None
+
+
+@pytest.mark.parametrize("late_ms", [0.0, 0.5, 3.0])
+def test_two_exposures_tell_how_long_they_are(late_ms):
+    points = [flat(0, late_ms=late_ms), flat(1, ms=20.0, late_ms=late_ms), flat(2, kV=40.0)]
+    found = setting_errors(points, source_detector_mm=MM)["exposure_ms"]
+    assert found["sd"] < 0.1
+    assert found["value"] == pytest.approx(late_ms, abs=0.1 + 0.2 * late_ms)
+
+
+def test_two_distances_tell_where_the_focal_spot_is():
+    points = [flat(0, near_mm=4.0), flat(1, mm=530.0, near_mm=4.0)]
+    found = setting_errors(points, source_detector_mm=MM)["distance_mm"]
+    assert found["value"] == pytest.approx(-4.0, abs=0.5)
+    assert found["sd"] < 2.0
+
+
+def test_beams_that_were_measured_at_other_exposures_are_less_sure_against_each_other(make_model_twin):
+    """A time that is 0.36 ms longer makes 5 ms 7 % brighter and 100 ms hardly at all: no spectrum did it."""
+    levels = [
+        dataclasses.replace(level, series=(f"flat_{number}",), source_detector_mm=None)
+        for number, level in enumerate(make_model_twin((8, 8)).levels)
+    ]
+    for ms, expected in ((100.0, 0.0), (5.0, EXPOSURE_SD_MS * (1 / 5 - 1 / 100) / 2)):
+        points = [flat(0, kV=40.0), flat(1, kV=90.0, ms=ms)]
+        errors = setting_errors(points, source_detector_mm=MM)
+        for before, after in zip(levels, allowing_for_settings(levels, points, errors), strict=True):
+            added = math.hypot(Z95 * expected, half_width(before.rate_DN_per_mAs))
+            assert half_width(after.rate_DN_per_mAs) == pytest.approx(added, rel=1e-6)
+    assert allowing_for_settings(levels, points, None) == tuple(levels)
+
+
+@pytest.mark.parametrize("measured_ms", [(100.0,), (100.0, 50.0)])
+def test_predictions_hold_exposures_that_are_longer_than_stated(tmp_path, make_model_twin, measured_ms):
+    late_ms = 0.6  # of the 1 ms that a generator may be off by
+    line, rng = make_model_twin((64, 64)), np.random.default_rng(0)
+
+    def truth(kV, ms):
+        return predict_flatfield(line, Setting(kV=kV, current_mA=1.0, exposure_ms=ms + late_ms, filters=COPPER))
+
+    def frames(mean_DN, sd_DN):
+        return np.round(1200.0 + mean_DN + sd_DN * rng.standard_normal((6, 64, 64))).astype(np.uint16)
+
+    with write_acquisition(tmp_path / "flats.h5", line.instrument) as writer:
+        for ms in measured_ms:
+            writer.add_series(f"dark_{ms:g}", kind="dark", exposure_ms=ms, frames=frames(0.0, 12.0))
+            for kV in (40.0, 90.0):
+                light = truth(kV, ms)
+                setting = Setting(kV=kV, current_mA=1.0, exposure_ms=ms, filters=COPPER)
+                shown = frames(light.mean_DN.value, light.sd_DN.value)
+                writer.add_series(f"flat_{kV:g}_{ms:g}", kind="flat", setting=setting, frames=shown)
+    with open_acquisition(tmp_path / "flats.h5") as acquisition:
+        twin = calibrate_twin(acquisition, rng=np.random.default_rng(0), advise=False)
+    for kV in (40.0, 90.0, 65.0):
+        there, short = (
+            predict_flatfield(twin, Setting(kV=kV, current_mA=1.0, exposure_ms=ms, filters=COPPER)).mean_DN
+            for ms in (100.0, 20.0)
+        )
+        assert short.low < truth(kV, 20.0).mean_DN.value < short.high
+        assert half_width(short) > half_width(there)
+        if len(measured_ms) == 1:
+            expected = Z95 * EXPOSURE_SD_MS * (1 / 20 - 1 / 100)
+            assert half_width(short) == pytest.approx(math.hypot(half_width(there), expected), rel=0.1)
+
+
+def test_evidence_of_older_twins_says_nothing_and_damaged_evidence_is_refused(make_model_twin):
+    twin, setting = make_model_twin((8, 8)), Setting(kV=60.0, current_mA=1.0, exposure_ms=20.0)
+    assert stray_of_setting(twin, setting, None, distance_mm=MM) == 0.0
+    row = {"series": "a", "used": True, "signal_DN": 100.0, "load_mAs": 0.1, "exposure_ms": 100.0}
+    damaged = {"photon_transfer": [row], "setting_errors": {"second_moments": [[1.0, "b"], [0.0, 1.0]]}}
+    with pytest.raises(InputError, match="setting_errors"):
+        stray_of_setting(dataclasses.replace(twin, evidence=damaged), setting, None, distance_mm=MM)

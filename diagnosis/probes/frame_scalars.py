@@ -21,6 +21,7 @@ from .probes import (
     OUTLIERS_ANYWHERE,
     REPEATED_FRAMES,
     Scalar,
+    noise_name,
 )
 from .scalar_context import ScalarContext, afterglow_bins, time_templates
 
@@ -92,13 +93,25 @@ class _Found:
     scalars: list[Scalar] = field(default_factory=list)
 
     def add(
-        self, axis: str, name: str, unit: str, value: float, sampling: float, floor: str, *, of: float = 1.0
+        self,
+        axis: str,
+        name: str,
+        unit: str,
+        value: float,
+        sampling: float,
+        floor: str,
+        *,
+        of: float = 1.0,
+        label: str = "",
+        lag: tuple[int, int] | None = None,
     ) -> None:
-        """One more, unless it is no number; floor: one of FLOORS, a share of `of`."""
+        """One more, unless it is no number; floor: one of FLOORS, a share of `of`; label and lag: as in `Scalar`."""
         if math.isfinite(value) and math.isfinite(sampling):
             value, sampling = float(value), float(sampling)
             sd = math.hypot(sampling, FLOORS[floor] * float(of))
-            self.scalars.append(Scalar(axis=axis, name=name, unit=unit, value=value, sd=sd, sampling_sd=sampling))
+            self.scalars.append(
+                Scalar(axis=axis, name=name, unit=unit, value=value, sd=sd, sampling_sd=sampling, label=label, lag=lag)
+            )
 
     @property
     def n_good(self) -> int:
@@ -142,15 +155,16 @@ class _Found:
             shared = self.shared(float(label_q[label]), float(label_w[label]))
             value = math.log(max(variance, LEAST_NOISE_DN2))
             sampling = math.sqrt(2.0 * shared / (self.freedom * pixels))
-            self.add("noise", f"log_variance {name}", "1", value, sampling, "log_variance")
-            for index, (dr, dc) in enumerate(LAGS):
+            self.add("noise", noise_name(name), "1", value, sampling, "log_variance", label=name)
+            for index, lag in enumerate(LAGS):
                 # pixels of a label that lies in stripes may have few neighbours
                 pairs = int(summary.label_pairs[label, index])
                 if pairs < _LEAST_PAIRS or variance < LEAST_NOISE_DN2:
                     continue
                 value = float(summary.label_autocovariance_DN2[label, index]) / variance
                 sampling = math.sqrt(1.3 * shared / (self.freedom * pairs))
-                self.add("texture", f"correlation {name} ({dr},{dc})", "1", value, sampling, "correlation")
+                known = noise_name(name, lag)
+                self.add("texture", known, "1", value, sampling, "correlation", label=name, lag=lag)
 
     def lines_blocks_and_times(self) -> None:
         """Noise of rows, columns and blocks, from frame to frame, of the whole frame; its tails."""

@@ -26,6 +26,7 @@ from .probes import (
     OUTLIERS_ANYWHERE,
     PATTERN_PIXEL_SHARE,
     REPEATED_FRAMES,
+    noise_name,
 )
 from .scalar_context import ScalarContext, afterglow_bins, frame_profile, time_templates
 
@@ -180,7 +181,7 @@ def _jumping(expected: ExpectedSeries, context: ScalarContext) -> tuple[float, f
 @lru_cache(maxsize=64)
 def _noise_names(label: str) -> tuple[str, tuple[str, ...]]:
     """Names of a label's variance and of its correlation at each of LAGS."""
-    return f"log_variance {label}", tuple(f"correlation {label} ({dr},{dc})" for dr, dc in LAGS)
+    return noise_name(label), tuple(noise_name(label, lag) for lag in LAGS)
 
 
 def _kurtosis(expected: ExpectedSeries, context: ScalarContext, variance_DN2: float) -> float:

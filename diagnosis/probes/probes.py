@@ -43,7 +43,10 @@ FLOORS: Mapping[str, float] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scalar:
-    """A scalar probe: axis, name, unit, measured value, its standard deviation, and the counting noise's part of it."""
+    """A scalar probe: axis, name, unit, measured value, its standard deviation, and the counting noise's part of it.
+
+    Noise of pixels of one label (`noise_name`) says which, and the lag of a correlation; elsewhere they are empty and None.
+    """
 
     axis: str
     name: str
@@ -51,6 +54,13 @@ class Scalar:
     value: float
     sd: float
     sampling_sd: float
+    label: str = ""
+    lag: tuple[int, int] | None = None
+
+
+def noise_name(label: str, lag: tuple[int, int] | None = None) -> str:
+    """Name of the probe of the variance of pixels of a label, or of their correlation with neighbours at a lag."""
+    return f"log_variance {label}" if lag is None else f"correlation {label} ({lag[0]},{lag[1]})"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

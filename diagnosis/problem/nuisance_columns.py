@@ -17,7 +17,7 @@ from ..model.forward_model import ForwardModel
 from ..model.point_maps import blurred_between_points, sampled_at_points
 from ..model.responses import Moved, SessionModel
 from ..probes.noise_correlation import correlation_sum
-from ..probes.probes import OUTLIERS, OUTLIERS_ANYWHERE
+from ..probes.probes import OUTLIERS, OUTLIERS_ANYWHERE, Scalar
 from ..probes.registration import CELL_SD_PX, RENDER_SHARE, gradient
 from ..session.even_maps import Map
 from ..session.session import SessionSeries
@@ -100,7 +100,7 @@ def _of_beam(probes: SeriesProbes, beams_differ: float) -> Columns:
     gain_sd = _UNKNOWN_GAIN_SD if unknown else beams_differ * scales.GAIN_OF_BEAM_SD
     columns: Columns = {
         f"gain of {_beam(item)}": probes.of_scalars(
-            lambda probe: gain_sd if probe.name.startswith("log_variance") else 0.0
+            lambda probe: gain_sd if probe.label and probe.lag is None else 0.0
         ),
         "output from frame to frame": probes.of_scalars(
             lambda probe: _of_steps(probes, probe.name) if probe.name == "frame_factor" else 0.0
@@ -108,7 +108,9 @@ def _of_beam(probes: SeriesProbes, beams_differ: float) -> Columns:
         # by their electronics (noise as the gain's square) or by the light that they catch (as the gain)
         "noise of bright pixels": probes.of_scalars(
             lambda probe: (
-                0.5 * scales.GAIN_EXPONENT_SD * math.log(brighter.get(probe.name.removeprefix("log_variance "), 1.0))
+                0.5 * scales.GAIN_EXPONENT_SD * math.log(brighter[probe.label])
+                if probe.label and probe.lag is None
+                else 0.0
             )
         ),
     }
@@ -121,10 +123,7 @@ def _of_beam(probes: SeriesProbes, beams_differ: float) -> Columns:
 
 
 def _texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.float64]:
-    ending = f"({lag[0]},{lag[1]})"
-    return probes.of_scalars(
-        lambda probe: scales.TEXTURE_SD if probe.name.startswith("correlation") and probe.name.endswith(ending) else 0.0
-    )
+    return probes.of_scalars(lambda probe: scales.TEXTURE_SD if probe.lag == lag else 0.0)
 
 
 def _read_texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.float64]:
@@ -142,14 +141,12 @@ def _read_texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.floa
         "block_ratio": (1.0 - down / BLOCK_PX) * (1.0 - across / BLOCK_PX),
     }
 
-    def of(name: str) -> float:
-        if name in within:
-            return float(2.0 * share * within[name] / math.exp(probes.series.scalars[name]))
-        known, _, ending = name.rpartition(" ")
-        label = known.removeprefix("correlation ")
-        return float(shares[label]) if label != known and ending == f"({lag[0]},{lag[1]})" else 0.0
+    def of(probe: Scalar) -> float:
+        if probe.name in within:
+            return float(2.0 * share * within[probe.name] / math.exp(probes.series.scalars[probe.name]))
+        return float(shares[probe.label]) if probe.lag == lag else 0.0
 
-    return scales.READ_TEXTURE_SD * probes.of_scalars(lambda probe: of(probe.name))
+    return scales.READ_TEXTURE_SD * probes.of_scalars(of)
 
 
 def _white_shares(probes: SeriesProbes) -> tuple[float, dict[str, float]]:
@@ -169,12 +166,11 @@ def brighter(probes: SeriesProbes, signal: NDArray[np.float64]) -> NDArray[np.fl
     """
     _, shares = _white_shares(probes)
 
-    def noisier(name: str) -> float:
-        label = name.removeprefix("log_variance ")
-        return 0.01 * (1.0 - shares[label]) if label != name and label in shares else 0.0
+    def noisier(probe: Scalar) -> float:
+        return 0.01 * (1.0 - shares[probe.label]) if probe.label and probe.lag is None else 0.0
 
     level = probes.of_maps(0.01 * signal[None])[0]
-    return np.asarray(level + probes.of_scalars(lambda probe: noisier(probe.name)))
+    return np.asarray(level + probes.of_scalars(noisier))
 
 
 def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: float) -> _Images:

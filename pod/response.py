@@ -30,6 +30,7 @@ from .trials import codes_from_labels
 Array = NDArray[np.float64]
 
 _PROBIT = LINKS["probit"]
+_NO_BOUNDS = (NO_BOUNDS, NO_BOUNDS, NO_BOUNDS)
 # p-values: a warning for one straight line in a hundred, no bounds for one in a thousand, as readings of a tube are left out
 _DOUBTED = 0.01
 _REJECTED = 0.001
@@ -108,6 +109,88 @@ def fit_response_pod(
         FitError: too few responses between the limits, or one size only.
     """
     x, y = _checked(size, response, log_size=log_size)
+    _check_limits(decision, left, right)
+    if repeats not in ("pooled", "cluster"):
+        raise InputError("repeats", received=repr(repeats), expected="pooled or cluster for a response")
+    power = _likeliest_power(x, y, left, right) if box_cox is None else box_cox
+    if power != 1 and not decision > 0:
+        raise InputError("decision", received=decision, expected="above 0 where the response is transformed")
+    line = _fit(x, y, power, left, right)
+    notes: list[str] = []
+    clustered: Clustered | None = None
+    unknown = False  # whether repeats are too few to tell their spread
+    if repeats == "cluster":
+        groups = _groups(network, image, rows=len(x))
+        if groups:
+            clustered = clustered_fit(line.score_rows(line.q), line.information_rows(line.q), groups)
+            unknown = clustered is None
+        else:
+            notes.append("no repeated network or image: the bounds are those of independent rows")
+    curve = _Curve.of(line, float(transformed(np.array(decision), power)), clustered)
+    smallest, largest = float(x.min()), float(x.max())
+    a50 = a90 = None
+    bounds = _NO_BOUNDS
+    if curve.c1 > 0:
+        sizes_at = {}
+        for percent in (50, 90):
+            sizes_at[percent], note = size_in_range(
+                curve.x_at(percent / 100), smallest=smallest, largest=largest, log_size=log_size, percent=percent
+            )
+            notes += [note] if note else []
+        a50, a90 = sizes_at[50], sizes_at[90]
+    else:
+        notes.append("the response does not rise with size: no a50 and no a90")
+    if a90 is not None and unknown:
+        notes.append(
+            "fewer than three networks or images, or one that alone holds up the line, tell no spread: no bounds on a90"
+        )
+    elif a90 is not None:
+        bounds = _bounds_on_a90(curve, rows=len(x), span=largest - smallest, log_size=log_size)
+        if bounds[1].likelihood_ratio is None:
+            notes.append("the likelihood gives no upper bound on a90: more sizes above it would")
+    p_line = p_scatter = None
+    if repeats == "pooled":
+        p_line, p_scatter = _tests_of_line(line, x)
+        rejected, doubt = _doubt(p_line, p_scatter)
+        bounds = _NO_BOUNDS if rejected else bounds
+        notes += [doubt] if doubt else []
+    sizes = np.exp(x) if log_size else x
+    h = float(line.q[2])
+    return ResponseFit(
+        log_size=log_size,
+        box_cox=power,
+        decision=decision,
+        n=len(x),
+        n_above=int(np.sum(y > decision)),
+        n_left_censored=int(line.left.sum()),
+        n_right_censored=int(line.right.sum()),
+        smallest_size=float(sizes.min()),
+        largest_size=float(sizes.max()),
+        intercept=float(line.q[0] / h),
+        slope=float(line.q[1] / h),
+        scatter=1.0 / h,
+        c0=curve.c0,
+        c1=curve.c1,
+        se0=math.sqrt(curve.covariance[0, 0]),
+        se1=math.sqrt(curve.covariance[1, 1]),
+        mu=-curve.c0 / curve.c1 if curve.c1 > 0 else None,
+        sigma=1 / curve.c1 if curve.c1 > 0 else None,
+        covariance=curve.covariance,
+        log_likelihood=line.log_likelihood,
+        a50=a50,
+        a90=a90,
+        a90_95=bounds[0],
+        a90_95_two_sided=bounds[1],
+        a90_low_two_sided=bounds[2],
+        reaches_90=bool(curve.c1 > 0 and curve.x_at(0.9) <= largest),
+        repeats=repeats,
+        warnings=tuple(notes),
+        p_line=p_line,
+        p_scatter=p_scatter,
+    )
+
+
+def _check_limits(decision: float, left: float | None, right: float | None) -> None:
     for name, limit in (("decision", decision), ("left", left), ("right", right)):
         if limit is not None and not (isinstance(limit, int | float | np.number) and math.isfinite(limit)):
             raise InputError(name, received=repr(limit), expected="a finite response")
@@ -120,167 +203,115 @@ def fit_response_pod(
             expected=f"a response between the limits, {-math.inf if left is None else left:g} to"
             f" {math.inf if right is None else right:g}: beyond them nothing was seen",
         )
-    if box_cox is None:
-        from scipy.optimize import minimize_scalar
 
-        def cost(power: float) -> float:
-            return -_fit(x, y, power, left, right).log_likelihood
 
-        box_cox = float(minimize_scalar(cost, bounds=(-1.0, 2.0), method="bounded", options={"xatol": 1e-4}).x)
-    if box_cox != 1 and not decision > 0:
-        raise InputError("decision", received=decision, expected="above 0 where the response is transformed")
-    line = _fit(x, y, box_cox, left, right)
-    threshold = float(transformed(np.array(decision), box_cox))
-    notes: list[str] = []
-    # c = M (gamma0, gamma1, h)
-    matrix = np.array([[1.0, 0.0, -threshold], [0.0, 1.0, 0.0]])
-    parameter_covariance = np.linalg.inv(line.information(line.q))
-    divisor = 1.0
-    clustered: Clustered | None = None
-    unknown = False
-    if repeats == "cluster":
-        groups = [
-            codes
-            for codes in (
-                None if labels is None else codes_from_labels(name, labels, len(x))
-                for name, labels in (("network", network), ("image", image))
-            )
-            if codes is not None and codes.max() > 0
-        ]
-        robust = parameter_covariance
-        if groups:
-            clustered = clustered_fit(line.score_rows(line.q), line.information_rows(line.q), groups)
-            unknown = clustered is None
-            if clustered is not None:
-                robust = clustered.covariance()
-        else:
-            notes.append("no repeated network or image: the bounds are those of independent rows")
-    elif repeats == "pooled":
-        robust = parameter_covariance
-    else:
-        raise InputError("repeats", received=repr(repeats), expected="pooled or cluster for a response")
-    c0, c1 = (float(value) for value in matrix @ line.q)
-    covariance = matrix @ robust @ matrix.T
-    h = float(line.q[2])
-    smallest, largest = float(x.min()), float(x.max())
-    a50 = a90 = None
-    one = two = low = NO_BOUNDS
-    if c1 > 0:
-        found: dict[int, float | None] = {}
-        for percent in (50, 90):
-            at = (_PROBIT.eta_from_pod(percent / 100) - c0) / c1
-            found[percent], note = size_in_range(
-                at, smallest=smallest, largest=largest, log_size=log_size, percent=percent
-            )
-            if note:
-                notes.append(note)
-        a50, a90 = found[50], found[90]
-    else:
-        notes.append("the response does not rise with size: no a50 and no a90")
-    if a90 is not None and unknown:
-        notes.append(
-            "fewer than three networks or images, or one that alone holds up the line, tell no spread: no bounds on a90"
-        )
-    elif a90 is not None:
-        x90 = (_PROBIT.eta_from_pod(0.9) - c0) / c1
-        toward = np.array([1.0, x90])
-        variance, freedom = float(toward @ covariance @ toward), math.inf
-        if clustered is not None:
-            spread, freedom_at = clustered.variance(toward @ matrix)
-            variance, freedom = float(spread), float(freedom_at)
-        # of few rows the scatter is known as well as so many rows less the line's two coefficients tell it
-        rows, left_over = float(line.exact.sum()), float(line.exact.sum()) - 2.0
+def _likeliest_power(x: Array, response: Array, left: float | None, right: float | None) -> float:
+    """The Box-Cox lambda within [-1, 2] under which the line is likeliest."""
+    from scipy.optimize import minimize_scalar
+
+    def cost(power: float) -> float:
+        return -_fit(x, response, power, left, right).log_likelihood
+
+    return float(minimize_scalar(cost, bounds=(-1.0, 2.0), method="bounded", options={"xatol": 1e-4}).x)
+
+
+def _groups(network: ArrayLike | None, image: ArrayLike | None, *, rows: int) -> list[NDArray[np.intp]]:
+    """Codes of networks and of images (row,), of those that repeat."""
+    named = (("network", network), ("image", image))
+    codes = [codes_from_labels(name, labels, rows) for name, labels in named if labels is not None]
+    return [one for one in codes if one.max() > 0]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Curve:
+    """The POD curve that a line gives: POD = probit(c0 + c1 x), with the decision at `threshold`, transformed.
+
+    Fields: line; threshold; matrix (2, 3): from the line's parameters to c0 and c1; covariance of these, robust to repeats
+    where `clustered` has their spread.
+    """
+
+    line: "_Line"
+    threshold: float
+    matrix: Array
+    c0: float
+    c1: float
+    covariance: Array
+    clustered: Clustered | None
+
+    @classmethod
+    def of(cls, line: "_Line", threshold: float, clustered: Clustered | None) -> "_Curve":
+        # c = M (gamma0, gamma1, h)
+        matrix = np.array([[1.0, 0.0, -threshold], [0.0, 1.0, 0.0]])
+        c0, c1 = (float(value) for value in matrix @ line.q)
+        robust = np.linalg.inv(line.information(line.q)) if clustered is None else clustered.covariance()
+        return cls(
+            line=line, threshold=threshold, matrix=matrix, c0=c0, c1=c1, covariance=matrix @ robust @ matrix.T,
+            clustered=clustered,
+        )  # fmt: skip
+
+    def x_at(self, pod: float) -> float:
+        """Where the curve has a POD."""
+        return float(_PROBIT.eta_from_pod(pod) - self.c0) / self.c1
+
+
+def _bounds_on_a90(curve: _Curve, *, rows: int, span: float, log_size: bool) -> tuple[Bounds, Bounds, Bounds]:
+    """One-sided upper, two-sided upper and two-sided lower 95 % bounds on a90.
+
+    rows: of the table; span: of its sizes, on the fit's axis.
+    """
+    line, clustered, x90 = curve.line, curve.clustered, curve.x_at(0.9)
+    toward = np.array([1.0, x90])
+    # of few rows the scatter is known as well as so many rows less the line's two coefficients tell it
+    exact = float(line.exact.sum())
+    left_over = exact - 2.0
+    variance, freedom, divisor = float(toward @ curve.covariance @ toward), left_over, 1.0
+    if clustered is not None:
+        spread, freedom_at = clustered.variance(toward @ curve.matrix)
+        independent = curve.matrix @ np.linalg.inv(line.information(line.q)) @ curve.matrix.T
+        variance, freedom = float(spread), float(freedom_at)
+        divisor = variance / float(toward @ independent @ toward)
+    error = math.sqrt(variance) / curve.c1
+
+    def wald(below: float, side: float) -> float | None:
         if clustered is None:
-            freedom = left_over
-        error = math.sqrt(variance) / c1
-        divisor = variance / float(toward @ matrix @ parameter_covariance @ matrix.T @ toward)
+            far = float(student_quantile(below, math.inf))
+            return x90 + side * far * error if rows >= _FEWEST_FOR_WALD else None
+        variances = clustered.variance
 
-        def wald(below: float, z: float, side: float) -> float | None:
-            if clustered is None:
-                return (
-                    x90 + side * float(student_quantile(below, math.inf)) * error
-                    if len(x) >= _FEWEST_FOR_WALD
-                    else None
-                )
-            variances = clustered.variance
+        def excess(at: float) -> tuple[float, float, float]:
+            value, m = variances(np.array([1.0, at]) @ curve.matrix)
+            return curve.c0 + curve.c1 * at - _PROBIT.eta_from_pod(0.9), float(value), float(m)
 
-            def excess(at: float) -> tuple[float, float, float]:
-                value, m = variances(np.array([1.0, at]) @ matrix)
-                return c0 + c1 * at - _PROBIT.eta_from_pod(0.9), float(value), float(m)
+        return size_from_test(excess, below=below, upper=side > 0, start=x90, span=span)
 
-            return size_from_test(excess, below=below, upper=side > 0, start=x90, span=largest - smallest)
+    def likelihood(below: float, side: float) -> float | None:
+        z = float(student_quantile(below, freedom))
+        allowed = exact * math.log1p(z * z / left_over) if clustered is None else z * z * divisor
+        return _bound(line, curve.threshold, x90, side * z * error, allowed)
 
-        bounds = [
-            Bounds(
-                likelihood_ratio=size_from_x(
-                    _bound(
-                        line,
-                        threshold,
-                        x90,
-                        side * z * error,
-                        rows * math.log1p(z * z / left_over) if clustered is None else z * z * divisor,
-                    ),
-                    log_size=log_size,
-                ),
-                wald=size_from_x(wald(below, z, side), log_size=log_size),
-            )
-            for below, side in ((ONE_SIDED, 1.0), (TWO_SIDED, 1.0), (TWO_SIDED, -1.0))
-            for z in (float(student_quantile(below, freedom)),)
-        ]
-        one, two, low = bounds
-        if two.likelihood_ratio is None:
-            notes.append("the likelihood gives no upper bound on a90: more sizes above it would")
-    p_line = p_scatter = None
-    if repeats == "pooled":
-        p_line, p_scatter = _tests_of_line(line, x)
-        departs = [
-            f"{what} (p {p:.2g})"
-            for what, p in (("the response bends", p_line), ("its scatter changes with size", p_scatter))
-            if p is not None and p < _DOUBTED
-        ]
-        if departs:
-            rejected = min(p for p in (p_line, p_scatter) if p is not None) < _REJECTED
-            if rejected:
-                one = two = low = NO_BOUNDS
-            notes.append(
-                " and ".join(departs)
-                + ", and a90 rests on a straight line with one scatter: "
-                + ("no bounds on a90" if rejected else "a90 and its bounds may be wrong")
-                + "; try log size, the logarithm of the response, box_cox auto, or hits above the decision, and name"
-                " the columns of looks that repeat"
-            )
-    sizes = np.exp(x) if log_size else x
-    return ResponseFit(
-        log_size=log_size,
-        box_cox=box_cox,
-        decision=decision,
-        n=len(x),
-        n_above=int(np.sum(y > decision)),
-        n_left_censored=int(line.left.sum()),
-        n_right_censored=int(line.right.sum()),
-        smallest_size=float(sizes.min()),
-        largest_size=float(sizes.max()),
-        intercept=float(line.q[0] / h),
-        slope=float(line.q[1] / h),
-        scatter=1.0 / h,
-        c0=c0,
-        c1=c1,
-        se0=math.sqrt(covariance[0, 0]),
-        se1=math.sqrt(covariance[1, 1]),
-        mu=-c0 / c1 if c1 > 0 else None,
-        sigma=1 / c1 if c1 > 0 else None,
-        covariance=covariance,
-        log_likelihood=line.log_likelihood,
-        a50=a50,
-        a90=a90,
-        a90_95=one,
-        a90_95_two_sided=two,
-        a90_low_two_sided=low,
-        reaches_90=bool(c1 > 0 and (_PROBIT.eta_from_pod(0.9) - c0) / c1 <= largest),
-        repeats=repeats,
-        warnings=tuple(notes),
-        p_line=p_line,
-        p_scatter=p_scatter,
+    upper, two_sided, lower = (
+        Bounds(
+            likelihood_ratio=size_from_x(likelihood(below, side), log_size=log_size),
+            wald=size_from_x(wald(below, side), log_size=log_size),
+        )
+        for below, side in ((ONE_SIDED, 1.0), (TWO_SIDED, 1.0), (TWO_SIDED, -1.0))
+    )
+    return upper, two_sided, lower
+
+
+def _doubt(p_line: float | None, p_scatter: float | None) -> tuple[bool, str]:
+    """Whether a straight line with one scatter is rejected, and what to say of it; empty: no doubt."""
+    tests = (("the response bends", p_line), ("its scatter changes with size", p_scatter))
+    departs = [f"{what} (p {p:.2g})" for what, p in tests if p is not None and p < _DOUBTED]
+    rejected = any(p is not None and p < _REJECTED for _, p in tests)
+    if not departs:
+        return rejected, ""
+    return rejected, (
+        " and ".join(departs)
+        + ", and a90 rests on a straight line with one scatter: "
+        + ("no bounds on a90" if rejected else "a90 and its bounds may be wrong")
+        + "; try log size, the logarithm of the response, box_cox auto, or hits above the decision, and name"
+        " the columns of looks that repeat"
     )
 
 

@@ -50,9 +50,9 @@ POSITION_SD_PX = 0.15  # of a scene against its thickness maps
 REGISTERED_SD_PX = 1.0  # of the same before registration looks (`register`): what that finds is in no series' pictures
 OUTLINE_SD_PX = 0.1  # of where an object's outline lies: rendering of the pixels that it cuts, true size
 MAGNIFICATION_SD = 0.001
-# of the variance of edges' blur in all scenes: a third of a pixel's own, 1/12, as a thickness may be a pixel's mean or its middle's.
-# Assumed; with three times as much or a third four sessions had the same names (docs/notebook/diagnosis_designs.md)
-EDGE_SD_PX2 = 1.0 / 36.0
+# of the variance of edges' blur in all scenes: maps drawn from 2 x 2 points a pixel lack 1/48 px^2 of a pixel's own 1/12, which
+# counts as two standard deviations. Maps of single points are found, and have nuisances of their own (`blurred_between_points`)
+EDGE_SD_PX2 = 1.0 / 96.0
 # of the width of the declared focal spot along either side: IEC 60336 allows half as much again above the nominal value, two
 # standard deviations; a point, as simulations may take it, lies two standard deviations of its image's variance below
 SPOT_SD = 0.25

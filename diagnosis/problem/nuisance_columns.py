@@ -61,9 +61,8 @@ def _of_its_own(model: ForwardModel, probes: SeriesProbes, signal: NDArray[np.fl
     if not item.calibrates:
         columns["few new bad pixels"] = _few_bad_pixels(probes)
     if item.series.kind == "object":
-        dy, dx = gradient(signal)
         columns |= _of_thickness(probes, signal, redrawn.thicker, beams_differ)
-        images |= _of_scene(item, dy, dx, sharp=model.sharp, rough=probes.rendered / RENDER_SHARE)
+        images |= _of_scene(item, signal, sharp=model.sharp, rough=probes.rendered / RENDER_SHARE)
         images |= _of_spot(declared_spot_px(model.base, item.request), signal)
         if model.sharp:
             images |= _between_points(item, signal)
@@ -229,25 +228,22 @@ def _few_bad_pixels(probes: SeriesProbes) -> NDArray[np.float64]:
     return probes.of_scalars(lambda probe: more if probe.name in (OUTLIERS, OUTLIERS_ANYWHERE) else 0.0)
 
 
-def _of_scene(
-    item: SessionSeries, dy: NDArray[np.float64], dx: NDArray[np.float64], *, sharp: bool, rough: float
-) -> _Images:
+def _of_scene(item: SessionSeries, signal: NDArray[np.float64], *, sharp: bool, rough: float) -> _Images:
     """Where a scene lies and how its outline is drawn.
 
-    dy, dx: slopes of the signal (row, column), DN a pixel; sharp: pixels see no farther than themselves; rough: how far outlines
+    signal: expected (row, column), DN; sharp: pixels see no farther than themselves; rough: how far outlines
     depart from their maps along them, over what is assumed.
     """
     place = _place(item)
-    rows, columns = dy.shape
+    dy, dx = gradient(signal)
+    rows, columns = signal.shape
     registered_px = CELL_SD_PX if sharp else scales.REGISTERED_SD_PX
     row = np.linspace(-0.5, 0.5, rows)[:, None] * rows
     across = np.linspace(-0.5, 0.5, columns)[None, :] * columns
     slope = np.hypot(dy, dx)
-    (yy, _), (_, xx) = gradient(dy), gradient(dx)
-    half = 0.5 * scales.EDGE_SD_PX2
     images: _Images = {
-        "edges, columns": half * xx,
-        "edges, rows": half * yy,
+        "edges, columns": _blurred_more(signal, scales.EDGE_SD_PX2, axis=1),
+        "edges, rows": _blurred_more(signal, scales.EDGE_SD_PX2, axis=0),
         f"column of {place}": registered_px * dx,
         f"row of {place}": registered_px * dy,
         f"outline of {place}": scales.OUTLINE_SD_PX * np.asarray(slope),

@@ -149,15 +149,6 @@ def _scenes(shape: tuple[int, int], material: str) -> dict[str, _Scene]:
     }
 
 
-def _scaled(setting: Setting, factor: float) -> Setting:
-    """The setting with another tube current."""
-    return replace(
-        setting,
-        current_mA=None if setting.current_mA is None else factor * setting.current_mA,
-        power_W=None if setting.power_W is None else factor * setting.power_W,
-    )
-
-
 def _as_bright(setting: Setting, as_: Setting, twin: Twin) -> Setting | None:
     """The setting with the current at which the open field is as bright as another's; None where tube or twin cannot."""
 
@@ -166,13 +157,13 @@ def _as_bright(setting: Setting, as_: Setting, twin: Twin) -> Setting | None:
         return float(np.mean(LineModel(twin, use_measured_level=False).expect(request).signal_DN))
 
     try:
-        found = _scaled(setting, level(as_) / max(level(setting), 1e-9))
+        found = setting.with_current_times(level(as_) / max(level(setting), 1e-9))
     except InputError:
         return None
     limits = twin.instrument
     power = found.power_W if found.power_W is not None else found.kV * (found.current_mA or 0.0)
     if limits.maximum_power_w is not None and power > limits.maximum_power_w:
-        found = _scaled(found, limits.maximum_power_w / power)
+        found = found.with_current_times(limits.maximum_power_w / power)
     if limits.maximum_kV is not None and found.kV > limits.maximum_kV:
         return None
     return found
@@ -181,7 +172,7 @@ def _as_bright(setting: Setting, as_: Setting, twin: Twin) -> Setting | None:
 def _exposed(setting: Setting, exposure_ms: float, *, equal_charge: bool) -> Setting:
     """The setting at another exposure time, at its current or at its charge."""
     factor = setting.exposure_ms / exposure_ms if equal_charge else 1.0
-    return replace(_scaled(setting, factor), exposure_ms=exposure_ms)
+    return replace(setting.with_current_times(factor), exposure_ms=exposure_ms)
 
 
 def measurements_lacking(problem: Problem) -> tuple[Measurement, ...]:

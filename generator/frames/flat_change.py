@@ -72,7 +72,9 @@ def flat_change(twin: Twin, effects: Sequence[AppliedEffect], setting: Setting) 
     bent = [item for item in usable if has_always_bent(item)]
     calibrated_DN = _calibrated_signal_DN(twin, setting)
     if bent and calibrated_DN is not None:
-        there = _change(twin, bent, _at_signal(setting, calibrated_DN / _level(_flat(twin, (), setting, cache))), cache)
+        there = _change(
+            twin, bent, setting.with_current_times(calibrated_DN / _level(_flat(twin, (), setting, cache))), cache
+        )
         found = found.over(there)
     elif bent:
         found = _change(twin, [item for item in usable if item not in bent], setting, cache)
@@ -87,15 +89,6 @@ def is_in_noise(item: AppliedEffect) -> bool:
 def has_always_bent(item: AppliedEffect) -> bool:
     """Whether the effect acts on the response and was there when levels were calibrated."""
     return item.since == "always" and effect_of(item).stage == "response"
-
-
-def _at_signal(setting: Setting, factor: float) -> Setting:
-    """The setting with another tube load, all else equal."""
-    return replace(
-        setting,
-        current_mA=None if setting.current_mA is None else factor * setting.current_mA,
-        power_W=None if setting.power_W is None else factor * setting.power_W,
-    )
 
 
 def _calibrated_signal_DN(twin: Twin, setting: Setting) -> float | None:

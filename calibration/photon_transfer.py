@@ -46,7 +46,7 @@ from .repeated_frames import (
     series_of_beams,
     warning_of,
 )
-from .setting_errors import setting_errors
+from .setting_errors import setting_errors, told_errors
 from .spread_fit import SpreadFit
 
 ESTIMATORS = ("pairs", "stack")
@@ -445,6 +445,7 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
         "read_variance_relative_sd": read_relative_sd,
         "dark_sd_DN": dark_map_sd(darks, good, last, exposure_ms, fit.read_variance_DN2),
     }
+    warnings += told_errors(evidence["setting_errors"])
     if flats.others:
         evidence["repeated_frames"] = evidence_of(flats.others, good)
         warnings.append(warning_of(evidence["repeated_frames"]))

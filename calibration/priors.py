@@ -67,6 +67,13 @@ PRIORS: dict[str, Prior] = {
         low=0.0,
         reason="relative variance of the voltage in an exposure: an eighth of the squared ripple, mean and sd over the ripples",
     ),
+    "shared_charge": Prior(
+        centre=0.35,
+        sd=0.35,
+        low=0.0,
+        high=1.0,
+        reason="share of a counter's photons whose charge two pixels share: few at 0.3 mm, most at 0.05 mm; none where it is added",
+    ),
     "log_output": Prior(
         centre=0.0, sd=0.3, reason="tube output over the model's: current, distance, worn anodes and fill factor"
     ),
@@ -252,9 +259,21 @@ UNDECLARED_THRESHOLD = Prior(
     high=HIGHEST_THRESHOLD_KEV,
     reason="threshold not declared: above noise (4 keV in silicon, 10 in CdTe), 20 to 35 where two energies are counted",
 )
+# of a counter, of which one pixel's variance over its mean tells the DN of a count (`counter_priors`)
 COUNTING_SWANK = Prior(
-    centre=-0.005, sd=0.01, low=-0.1, high=0.0, reason="a counter has no energy-dependent pulse noise"
+    centre=-0.2,
+    sd=0.3,
+    low=-1.1,
+    high=0.0,
+    reason="noise of counts summed over neighbours, which a photon that they share raises by up to a factor of two or three",
 )
+COUNT_SD = 0.01  # relative, of the DN of a count, however well slopes agree: dead times, defects
+# of the logarithm of gain over slope, which charge on two pixels raises: on three or four, and by K photons, it counts more often, up
+# to as much again; two standard deviations
+COUNTED_MORE_SHARE = 0.5
+# shared charge over the logarithm of gain over slope, and its uncertainty: shared at random by two pixels, all charge raises that by
+# 0.3 (threshold at 0.4 of the energy) to 0.7 (at 0.05)
+SHARED_OVER_EXCESS, SHARED_OVER_EXCESS_SD = 2.0, 1.0
 ATTENUATION_SCALE = Prior(centre=0.0, sd=0.01, reason="density and thickness of a filter")
 TABLE_SHARE = Prior(
     centre=0.33, sd=0.47, reason="0 is xraylib, 1 the other table: xraylib, Chantler and PENELOPE are equally likely"

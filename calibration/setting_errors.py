@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..generator.line.measured_flats import USUAL_STRAY, rate_changes, stray_of_rates
-from ..generator.line.twin import Level
+from ..generator.line.twin import Z95, Level
 from .flat_levels import SeriesPoint
 
 # between a line's readout (0.02 ms) and the 1 ms that IEC 60601-2-54 allows a loading time, beside 10 % of it which all exposures
 # share; each order of magnitude alike: rms sqrt((1 - 0.02^2) / (2 ln 50)) ms
 EXPOSURE_SD_MS = 0.36
-DISTANCE_SD = (
-    0.01  # relative: 21 CFR 1020.31 (e) allows indicators of the source-image distance 2 %, two standard deviations
-)
+# relative: 21 CFR 1020.31 (e) allows indicators of the source-image distance 2 %, two standard deviations
+DISTANCE_SD = 0.01
+_CLEAR = 3.0  # standard deviations: one line in 400 is told without cause
 
 
 def setting_errors(points: Sequence[SeriesPoint], *, source_detector_mm: float | None) -> dict[str, Any] | None:
@@ -63,6 +63,20 @@ def setting_errors(points: Sequence[SeriesPoint], *, source_detector_mm: float |
         "distance_mm": {"value": float(found[1]), "sd": float(sd[1])},
         "second_moments": (covariance + np.outer(found, found)).tolist(),
     }
+
+
+def told_errors(errors: Mapping[str, Any] | None) -> list[str]:
+    """A line for each error that is three standard deviations from 0."""
+    told = []
+    for name, what, unit in (("exposure_ms", "exposures", "ms"), ("distance_mm", "source-detector distances", "mm")):
+        found = errors[name] if errors is not None else {"value": 0.0, "sd": 1.0}
+        if abs(found["value"]) > _CLEAR * found["sd"]:
+            away = f"{abs(found['value']):.2g} {unit} {'longer' if found['value'] > 0 else 'shorter'} than stated"
+            told.append(
+                f"flats of one beam fit {what} that are {away} (+-{Z95 * found['sd']:.1g} {unit}), or a dark level or a response"
+                " that bends: levels at others have wider intervals for it; state the true ones if these are wrong"
+            )
+    return told
 
 
 def allowing_for_settings(

@@ -22,6 +22,7 @@ from ..generator.line.spectral_signal import (
     ALTERNATIVE_SCINTILLATOR,
     KERMA_OUTPUT,
     OTHER_TABLES,
+    SHARED_CHARGE,
     THRESHOLD,
     OpenBeam,
     SpectralModel,
@@ -47,6 +48,8 @@ from .dose_data import (
 )
 from .priors import (
     ATTENUATION_SCALE,
+    COUNT_SD,
+    COUNTED_MORE_SHARE,
     COUNTING_SWANK,
     FREE_OUTPUT,
     GADOLINIUM_SHARE,
@@ -56,6 +59,8 @@ from .priors import (
     MEASURED_SPECTRUM,
     NONE_OR_SOME,
     PRIORS,
+    SHARED_OVER_EXCESS,
+    SHARED_OVER_EXCESS_SD,
     SHARES_CORRELATION,
     TABLE_SHARE,
     THRESHOLD_SD_KEV,
@@ -95,6 +100,7 @@ SHAPE_PARAMETERS = (
     "escape_scale",
     *NONE_OR_SOME,
     THRESHOLD,
+    SHARED_CHARGE,
     ALTERNATIVE_SCINTILLATOR,
 )
 DEFAULT_SCINTILLATOR = (Filter(material="CsI", thickness_mm=0.5),)
@@ -255,6 +261,38 @@ def priors_for(
     return result
 
 
+def counter_priors(levels: Sequence[Level]) -> dict[str, Prior]:
+    """What slopes and gains of a counter's levels say of the DN of a count and of the charge that neighbours share.
+
+    A pixel counts a photon once or not at all, so that its counts have the variance of their mean: the slope is the DN of a count.
+    Counts of a photon that neighbours share add to noise summed over them, which the gain is of. How many photons count more
+    than twice is not known. Nothing where no level has both.
+    """
+    known = [level for level in levels if level.photon_transfer_slope_DN.value > 0 and level.gain_DN.value > 0]
+    if not known:
+        return {}
+    slopes = [level.photon_transfer_slope_DN for level in known]
+    excess = max(
+        float(np.mean([math.log(one.gain_DN.value / one.photon_transfer_slope_DN.value) for one in known])), 0.0
+    )
+    excess_sd = float(np.mean([_relative_sd(level.gain_DN) for level in known]))  # of the spread, the same in all
+    logarithm = np.log([slope.value for slope in slopes])
+    weight = np.array([max(_relative_sd(slope), 1e-6) ** -2.0 for slope in slopes])
+    centre = float(weight @ logarithm / weight.sum())
+    misfit = float(weight @ (logarithm - centre) ** 2) / max(len(slopes) - 1, 1)
+    sd = math.hypot(COUNT_SD, COUNTED_MORE_SHARE * excess, math.sqrt(max(misfit, 1.0) / float(weight.sum())))
+    generic = PRIORS[SHARED_CHARGE]
+    return {
+        "log_DN_per_keV": Prior(centre=centre, sd=sd, reason="DN of a count: variance of a pixel over its mean"),
+        SHARED_CHARGE: replace(
+            generic,
+            centre=min(SHARED_OVER_EXCESS * excess, generic.high),
+            sd=min(math.hypot(COUNT_SD, SHARED_OVER_EXCESS * excess_sd, SHARED_OVER_EXCESS_SD * excess), generic.sd),
+            reason="share of photons whose charge two pixels share: from gain over slope",
+        ),
+    }
+
+
 def model_for(
     instrument: Instrument,
     *,
@@ -397,7 +435,8 @@ def fit_spectrum(
         model_name=model_name,
         correction=correction,
         more_names=dose_parameters(kermas, ratios, with_flats=bool(known)),
-        secondary_DN=0.0 if noise is None else secondary_of_levels(known, noise) or 0.0,
+        # a counter's white noise is of counts, not of light
+        secondary_DN=0.0 if noise is None or instrument.counting else secondary_of_levels(known, noise) or 0.0,
     )
     priors = priors_for(
         model,
@@ -406,6 +445,8 @@ def fit_spectrum(
         geometry_declared=not known
         or (instrument.pixel_mm is not None and all(level.source_detector_mm for level in known)),
     )
+    if model.counting:
+        priors |= counter_priors(known)
     if (kermas or ratios) and correction is None:
         priors["inherent_filtration_mm_Al"] = DOSE_FILTRATION
     absorbers = absorber_priors(model, np.array([priors[name].centre for name in model.names]), ratios)

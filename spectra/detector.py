@@ -1,5 +1,6 @@
 """What a detector keeps of each photon: absorption in the sensitive layer, less the K-fluorescence that escapes."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -167,25 +168,28 @@ def counted_fraction(
     threshold_keV: ArrayLike,
     layer: Filter,
     escape: bool = True,
+    shared: bool = False,
     library: Library | None = None,
 ) -> FloatArray:
-    """Chance that a photon which interacts in a counter's sensitive layer is counted: what it leaves lies above the threshold.
+    """Counts that a photon makes which interacts in a counter's sensitive layer: of the charges that lie above the threshold.
 
-    With p_j the chance that a K photon of energy E_j leaves the layer, and Phi the normal distribution:
+    With p_j the chance that a K photon of energy E_j leaves the layer, and c(E) the counts of an energy E that stays:
 
-        (1 - sum_j p_j) Phi((E - T) / s) + sum_j p_j Phi((E - E_j - T) / s)
+        (1 - sum_j p_j) c(E) + sum_j p_j c(E - E_j)
 
-    Charge that neighbours share is left out.
+    c = Phi(z), z = (E - T) / s, the normal distribution, where one pixel has all of the charge. Where two pixels share it, at
+    random, each of them counts if its part lies above T: c = 2 <max(0, 1 - T / E)> = 2 (s / E) (z Phi(z) + phi(z)).
 
     Args:
         energies_keV: (n,) photon energies.
-        threshold_keV: (m,) thresholds T; 0 counts every photon that interacts.
+        threshold_keV: (m,) thresholds T; 0 counts every photon that interacts once.
         layer: the sensitive layer.
         escape: False leaves the K photons out.
+        shared: whether two pixels share every charge.
         library: where the name is looked up.
 
     Returns:
-        (m, n), 0 to 1.
+        (m, n), 0 to 1; 0 to 2 of shared charges.
 
     Raises:
         InputError: an unknown material, or a layer without thickness.
@@ -206,9 +210,17 @@ def counted_fraction(
     material = material_from_name(layer.material, library=library)
     escaping = k_escape_fractions(material, energies, thickness_mm=layer.thickness_mm) if escape else []
     kept = 1.0 - np.sum([fraction for _, fraction in escaping], axis=0) if escaping else np.ones_like(energies)
-    found = kept * ndtr((energies - thresholds) / COUNTER_SD_KEV)
+
+    def counts(left_keV: FloatArray) -> FloatArray:
+        z = (left_keV - thresholds) / COUNTER_SD_KEV
+        if not shared:
+            return np.asarray(ndtr(z))
+        above_keV = COUNTER_SD_KEV * (z * ndtr(z) + np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi))
+        return np.asarray(2.0 * above_keV / np.maximum(left_keV, COUNTER_SD_KEV))
+
+    found = kept * counts(energies)
     for line_keV, fraction in escaping:
-        found += fraction * ndtr((energies - line_keV - thresholds) / COUNTER_SD_KEV)
+        found += fraction * counts(energies - line_keV)
     return np.where(thresholds > 0, found, 1.0)
 
 

@@ -10,7 +10,13 @@ from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.acquisition.setting import Setting, filters_from_text
 from raytwin.calibration.calibrate import calibrate_twin
 from raytwin.calibration.flat_levels import SeriesPoint
-from raytwin.calibration.setting_errors import DISTANCE_SD, EXPOSURE_SD_MS, allowing_for_settings, setting_errors
+from raytwin.calibration.setting_errors import (
+    DISTANCE_SD,
+    EXPOSURE_SD_MS,
+    allowing_for_settings,
+    setting_errors,
+    told_errors,
+)
 from raytwin.errors import InputError
 from raytwin.generator.line.measured_flats import stray_of_setting
 from raytwin.generator.line.twin import Z95
@@ -48,6 +54,8 @@ def test_two_exposures_tell_how_long_they_are(late_ms):
     found = setting_errors(points, source_detector_mm=MM)["exposure_ms"]
     assert found["sd"] < 0.1
     assert found["value"] == pytest.approx(late_ms, abs=0.1 + 0.2 * late_ms)
+    told = told_errors(setting_errors(points, source_detector_mm=MM))
+    assert len(told) == int(late_ms > 0.0) and all("longer than stated" in line for line in told)
 
 
 def test_two_distances_tell_where_the_focal_spot_is():

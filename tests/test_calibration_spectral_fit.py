@@ -564,6 +564,43 @@ def kerma_of(posterior, beam):
     return np.quantile(found.kerma_uGy_per_mAs, [0.5, 0.025, 0.975])
 
 
+def counted(flat):
+    """The flat of a counter: a pixel's variance is its mean, whatever neighbours share."""
+    return replace(flat, photon_transfer_slope_DN=estimate_from_sd(1.0, 0.005))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.8])
+def test_charge_that_neighbours_share_makes_no_other_spectrum_or_dose(share):
+    """Charge of each photon falls on one pixel, or at random on two, each of which counts a part above 20 keV."""
+    beams = [OpenBeam(kV=kV, filters=filters_from_text(text)) for kV in (50.0, 80.0, 110.0) for text in ("", "Al:2")]
+    tube, energies = SpectralModel(filter_materials=("Al", "Cu")), energy_grid_keV(112.0)
+    best = typical(tube, inherent_filtration_mm_Al=1.5)
+    stopped = transmission(filters_from_text("CdTe:0.003"), energies) * (
+        1.0 - transmission(COUNTER.scintillator, energies)
+    )
+    above = np.maximum(1.0 - 20.0 / energies, 0.0), np.maximum(1.0 - 40.0 / energies, 0.0)
+    counts = stopped * ((1.0 - share) * (energies > 20.0) + share * 2.0 * above[0])
+    squares = stopped * ((1.0 - share) * (energies > 20.0) + share * 2.0 * (above[0] + above[1]))
+    flats = []
+    for beam in beams:
+        found = tube.weights(best[None, :], beam)[0]
+        photons = np.concatenate([found, np.zeros(energies.size)])[: energies.size]
+        mean = float(photons @ counts)
+        flats.append(counted(level(beam.kV, beam.filters, mean, float(photons @ squares) / mean)))
+    bare = OpenBeam(kV=60.0, filters=())
+    posterior = fit_spectrum(flats, replace(COUNTER, threshold_keV=20.0), rng=np.random.default_rng(3)).posterior
+    truth = float(tube.signal(best[None, :], bare).kerma_uGy_per_mAs[0])
+    _, low, high = kerma_of(posterior, bare)
+    assert low < truth < high
+    model = model_of_posterior(posterior, highest_kV=110.0)
+    weights = model.weights(posterior.samples, bare)
+    mean_keV = weights @ model.energies_keV[: weights.shape[1]] / weights.sum(axis=1)
+    weights = tube.weights(best[None, :], bare)[0]
+    low, high = np.quantile(mean_keV, [0.025, 0.975])
+    assert low < weights @ tube.energies_keV[: weights.size] / weights.sum() < high
+    assert np.median(posterior.column("shared_charge")) < 0.4 or share > 0.0
+
+
 def test_the_threshold_of_a_counter_is_found_from_its_flats_and_the_dose_with_it():
     """A sum over energies of its own: photons that the layer stops and that leave more than 20 keV are counted."""
     beams = [
@@ -582,7 +619,7 @@ def test_the_threshold_of_a_counter_is_found_from_its_flats_and_the_dose_with_it
         found = tube.weights(best[None, :], beam)[0]
         return np.concatenate([found, np.zeros(energies.size)])[: energies.size]
 
-    flats = [level(beam.kV, beam.filters, float(photons(beam) @ seen), 1.0) for beam in beams]
+    flats = [counted(level(beam.kV, beam.filters, float(photons(beam) @ seen), 1.0)) for beam in beams]
     bare = OpenBeam(kV=60.0, filters=())
     truth = float(tube.signal(best[None, :], bare).kerma_uGy_per_mAs[0])
     posterior = fit_spectrum(flats, COUNTER, rng=np.random.default_rng(3)).posterior

@@ -83,6 +83,18 @@ def test_moments_agree_with_photons_followed_one_by_one(name: str, thickness_mm:
     )[0, 0]
     assert abs(np.mean(pulse_keV > threshold_keV) - share) < 4.5 * np.sqrt(share * (1.0 - share) / inside.sum())
 
+    # the same where two pixels share the charge at random, with a threshold that both may pass
+    part, threshold_keV = rng.random(int(inside.sum())), 0.3 * energy_keV
+    thresholds_keV = threshold_keV + COUNTER_SD_KEV * rng.standard_normal(part.size)
+    counts = sum((one * deposited_keV[inside] > thresholds_keV).astype(int) for one in (part, 1.0 - part))
+    expected = counted_fraction(
+        energies_keV=[energy_keV],
+        threshold_keV=[threshold_keV],
+        layer=Filter(material=name, thickness_mm=thickness_mm),
+        shared=True,
+    )[0, 0]
+    assert abs(counts.mean() - expected) < 4.5 * counts.std() / np.sqrt(counts.size)
+
 
 def test_k_lines_of_caesium_iodide_escape_as_published() -> None:
     # Iodine and caesium K-alpha at 28.5 and 30.9 keV (X-ray Data Booklet); no escape below the edge of each

@@ -6,8 +6,8 @@ fraction D(E)):
     N(E)    = kappa Phi(E; kV (1 + e)) (kV / 60)^x (E / 50)^(h + u ln(kV / 60)) (2 - 2 E / kV)^s exp(-sum mu t) (1000 / d)^2 a^2
     signal  = gamma sum N c l m1    gain = (gamma / A_S) sum N c l^2 m2 (E / 50)^-w / sum N c l m1 + W    absorbed = sum N c D
 
-for energy-integrating detectors; a counting detector has m1 = m2 = D q and l = 1, with q the share of
-what is stopped that lies above its threshold (`spectra.counted_fraction`). gamma is in DN per keV absorbed, s how much
+for energy-integrating detectors; a counting detector has m1 = m2 = D q and l = 1, with q the counts
+of a photon that is stopped (`spectra.counted_fraction`). gamma is in DN per keV absorbed or count, s how much
 steeper than SpekPy's a spectrum falls to its end point (E below 0.98 kV), e = kV_error + kV_tilt ln(kV / 60), and mu that of
 xraylib moved by shares of its differences to two other tables: mu (1 + c (Chantler / xraylib - 1) + p (PENELOPE / xraylib - 1)).
 The layers t are those in the beam, the inherent filtration, and micrometres of the anode's own metal (a rough or worn anode). A
@@ -79,6 +79,7 @@ RESPONSE_PARAMETERS: dict[str, tuple[float, float, float]] = {
 _RESPONSE_OF_COUNTERS = ("cover_mm_C", "cover_mm_Al", "dead_layer_um")
 _OF_UNDECLARED_COVER = "cover_mm_Al"
 THRESHOLD = "threshold_keV"
+SHARED_CHARGE = "shared_charge"  # share of the photons of a counter whose charge two pixels share
 # thresholds of counters (node,), keV, between which the counted share is linear
 THRESHOLDS_KEV: NDArray[np.float64] = np.linspace(0.0, HIGHEST_THRESHOLD_KEV, 161)
 ALTERNATIVE_SCINTILLATOR = "scintillator_alternative"
@@ -86,7 +87,15 @@ ALTERNATIVE_SCINTILLATOR = "scintillator_alternative"
 KERMA_OUTPUT = "log_kerma_over_flats"
 OTHER_TABLES = ("chantler", "penelope")
 # parameters that say nothing of the tube: a dosimeter does not notice them
-_OF_DETECTOR = ("log_DN_per_keV", "log_swank", "scintillator_table", "escape_scale", THRESHOLD, *RESPONSE_PARAMETERS)
+_OF_DETECTOR = (
+    "log_DN_per_keV",
+    "log_swank",
+    "scintillator_table",
+    "escape_scale",
+    THRESHOLD,
+    SHARED_CHARGE,
+    *RESPONSE_PARAMETERS,
+)
 _ABSORBER = "absorber_mm:"
 # tube voltages (node,), kV, between which the fluence is linear, half a per cent apart at most: 1e-4 of a signal at 40 kV
 # (behind 0.3 mm of copper 8e-4), a tenth of that from 90 kV on
@@ -222,7 +231,7 @@ class SpectralModel:
         if cover is not None:
             every.remove(_OF_UNDECLARED_COVER)
         every += [ALTERNATIVE_SCINTILLATOR] if self.alternative else []
-        every += [THRESHOLD] if counting else []
+        every += [THRESHOLD, SHARED_CHARGE] if counting else []
         for material in self.filter_materials:
             every.append(attenuation_scale_name(material))
             every += [table_share_name(table, material) for table in OTHER_TABLES]
@@ -507,11 +516,14 @@ class SpectralModel:
         found[1] += by_table * found[3] + by_escape * found[5]
         if THRESHOLD in self._index:
             thresholds = self._column(samples, THRESHOLD)
-            escaping, kept = (
-                _interpolate(THRESHOLDS_KEV, table, thresholds)
-                for table in _counted_tables(self.scintillator[0], self.energies_keV.size)
+            tables = _counted_tables(self.scintillator[0], self.energies_keV.size)
+            alone, shared = (
+                escaping + by_escape * (escaping - kept)
+                for escaping, kept in (
+                    [_interpolate(THRESHOLDS_KEV, table, thresholds) for table in pair] for pair in tables
+                )
             )
-            found *= escaping + by_escape * (escaping - kept)
+            found *= alone + self._column(samples, SHARED_CHARGE)[:, None] * (shared - alone)
         powers = self._response_powers(samples, self.energies_keV.size)
         if powers is not None:
             found[::2] *= powers[0]
@@ -811,14 +823,20 @@ def _response_tables(
 
 @lru_cache(maxsize=16)
 def _counted_tables(layer: Filter, bins: int) -> NDArray[np.float64]:
-    """Share of the photons that interact in a counter's layer which it counts (2, node of threshold, energy).
+    """Counts of a photon that interacts in a counter's layer (2, 2, node of threshold, energy).
 
-    The first where all K photons that a slab lets out leave, the second where none does.
+    Along the first axis: of charge that one pixel has, and that two pixels share; along the second: all K photons that a slab
+    lets out leave, and none does.
     """
     energies = energy_grid_keV(500.0)[:bins]
     tables = [
-        counted_fraction(energies_keV=energies, threshold_keV=THRESHOLDS_KEV, layer=layer, escape=escape)
-        for escape in (True, False)
+        [
+            counted_fraction(
+                energies_keV=energies, threshold_keV=THRESHOLDS_KEV, layer=layer, escape=escape, shared=shared
+            )
+            for escape in (True, False)
+        ]
+        for shared in (False, True)
     ]
     return np.array(tables)
 

@@ -95,6 +95,12 @@ def slope_share(twin: Twin) -> float:
     return (share + white) / (1.0 + white)
 
 
+def gains_differ(levels: Sequence[Level]) -> float:
+    """Relative standard deviation of the levels' gains: of a counter, how differently neighbours share in different beams."""
+    known = [math.log(level.gain_DN.value) for level in levels if level.gain_DN.value > 0]
+    return float(np.std(known, ddof=1)) if len(known) > 1 else 0.0
+
+
 def slope_over_gain(
     levels: Sequence[Level], noise: NoiseModel, gain_DN: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:

@@ -18,7 +18,7 @@ from ..line.line_limits import check_count_rate, check_limits
 from ..line.measured_flats import USUAL_STRAY, measured_flats, stray_of_flats, stray_of_noise, stray_of_setting
 from ..line.spectral_signal import OpenBeam
 from ..line.twin import Z95, Estimate, Level, SpectralPosterior, Twin, estimate_from_log_draws, estimate_from_sd
-from ..line.twin_spectrum import slope_over_gain, slope_share, spectral_model_of
+from ..line.twin_spectrum import gains_differ, slope_over_gain, slope_share, spectral_model_of
 
 if TYPE_CHECKING:
     import pandas
@@ -412,6 +412,7 @@ def _by_model(
     level_sd = math.hypot(widen * posterior.level_discrepancy, beyond_repeats, of_setting)
     gain_sd = widen * posterior.gain_discrepancy
     share, restored_sd = slope_share(twin), _restored_sd(twin)
+    own_gain_sd = gains_differ(twin.levels) if posterior.counting else 0.0
     # level and gain are known together, not one by one: their product draw by draw
     own_share = slope_over_gain(twin.levels, twin.noise, signal.gain_DN)
     at_object_mm = twin.instrument.source_object_mm
@@ -420,7 +421,7 @@ def _by_model(
         at_object_mm = distance_mm
     return _Flat(
         mean_DN=_estimate_from_draws(rate_draws, level_sd),
-        gain_DN=_estimate_from_draws(signal.gain_DN, math.hypot(gain_sd, restored_sd)),
+        gain_DN=_estimate_from_draws(signal.gain_DN, math.hypot(gain_sd, restored_sd, own_gain_sd)),
         quantum_DN2=signal.gain_DN * (share if own_share is None else own_share) * rate_draws,
         quantum_sd=math.hypot(level_sd, gain_sd),
         # photons are counted by the gain: what it is known less by, they are as well

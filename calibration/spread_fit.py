@@ -78,7 +78,8 @@ class SpreadFit:
     Fields: spread; family (in words); others: families that are likely as well; spread_sd (parameter -> standard deviation, of
     sigma_px, aspect, tail_share and tail_px); gain_DN (group,): quantum and signal-following white variance per signal with the
     spread's share restored; slope_DN (group,): variance of one pixel per signal; their standard deviations gain_sd_DN and
-    slope_sd_DN; shared_gain_sd: relative standard deviation of gain over slope, by which all gains are off alike;
+    slope_sd_DN; shared_gain_sd: relative standard deviation of gain over slope, by which all gains are off alike, and by
+    which beams differ;
     white_fraction (group,): the white part over the quantum part; read_variance_DN2 of a pixel, rows' and columns' offsets in
     it, read_sd_DN2, most_read_DN2 that it can be; row_variance_DN2, column_variance_DN2: of these; chi_square, degrees;
     excess_DN2: slow changes left, one a series; series_ratio: noise of each series over the fitted, with its standard
@@ -899,6 +900,13 @@ def _fit_of(
     logs_covariance += np.outer(both, both)
     logs_covariance[:groups, :groups] += route
     quantum, white = chosen.coefficients[:groups], chosen.coefficients[groups : 2 * groups]
+    low, whole = _of_beams(problem, chosen, expected)
+    # slopes follow their own beam, as the noise of its frames does; gains go with one spread, which images have
+    gain_own, gain_open = _own_to_beams(low, groups - 1)
+    gain_variance += gain**2 * (gain_own**2 + gain_open**2)
+    slope_own, slope_open = _own_to_beams(whole, groups)
+    slope_variance = slope_variance * (1.0 + slope_own) ** 2 + (slope * slope_open) ** 2
+    slope = slope * (1.0 + slope_own)
     rows, columns, lines_sd = _line_variances(series, group)
     read = float(chosen.coefficients[2 * groups])
     excess = np.zeros(len(series))
@@ -923,7 +931,10 @@ def _fit_of(
         chi_square=chosen.chi_square,
         degrees=problem.independent,
         excess_DN2=excess,
-        shared_gain_sd=_sd_of_gain_over_slope(logs_covariance),
+        # a beam that was not measured may spread otherwise as the measured ones do
+        shared_gain_sd=math.hypot(
+            _sd_of_gain_over_slope(logs_covariance), math.sqrt(float(np.mean(gain_own**2 + gain_open**2)))
+        ),
         series_ratio=tuple(ratios),
         other_route=other,
         criteria={
@@ -947,6 +958,51 @@ def _of_series(problem: _Problem, item: _Candidate, expected: Sequence[FloatArra
         else:
             found.append((math.nan, math.nan))
     return found
+
+
+def _of_beams(
+    problem: _Problem, item: _Candidate, expected: Sequence[FloatArray]
+) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
+    """Noise of each beam's quanta over the fitted, with its standard deviation: at low frequencies, less that of all, and whole.
+
+    Light made at other depths spreads otherwise (Lubberts, J. Opt. Soc. Am. 58 (1968) 1475), and beams are stopped at
+    other depths. The whole is a pixel's variance, which asks no kernel at all; nan where a beam has no such frequency.
+    """
+    read = float(item.coefficients[2 * problem.groups])
+    sums = np.zeros((2, 3, problem.groups))  # of modes: measured less expected, expected of the quanta, variance
+    every = zip(problem.series, problem.group, expected, _slow_changes(problem, item), strict=True)
+    for one, group, power, slow in every:
+        if group < 0:
+            continue
+        frequency = np.arange(power.shape[0]) / one.square_px
+        inside = frequency[:, None] ** 2 + frequency[None, :] ** 2 < _LOW_BAND**2
+        for row, band in enumerate((one.used & inside, one.used)):
+            modes = one.modes[band]
+            # series of one beam count by how well they know it
+            precision = 1.0 / max(float(np.mean(power[band])), 1e-300) if band.any() else 0.0
+            sums[row, 0, group] += precision * float(modes @ (one.power_DN2 - power - slow)[band])
+            sums[row, 1, group] += precision * float(modes @ (power - read * problem.electronic[one.square_px])[band])
+            sums[row, 2, group] += precision**2 * float(modes @ (power + slow)[band] ** 2)
+    found = []
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio, sd = 1.0 + sums[:, 0] / sums[:, 1], np.sqrt(sums[:, 2]) / sums[:, 1]
+        weight = np.where(np.isfinite(sd[0]), sd[0], np.inf) ** -2.0
+        ratio[0] -= float(weight @ np.nan_to_num(ratio[0] - 1.0)) / max(float(weight.sum()), 1e-300)
+    for row in range(2):
+        found.append([(float(one), float(own)) for one, own in zip(ratio[row], sd[row], strict=True)])
+    return found[0], found[1]
+
+
+def _own_to_beams(ratios: Sequence[tuple[float, float]], degrees: int) -> tuple[FloatArray, FloatArray]:
+    """What each beam's noise departs from the fit by (group,), relative, and what is open of that.
+
+    Departures are drawn from one normal distribution, whose variance is what chi-square wants (`_wanted_by`).
+    """
+    own = _wanted_by(ratios, degrees)
+    known = np.array(ratios).reshape(-1, 2)
+    sampling = np.where(np.isfinite(known[:, 1]), known[:, 1] ** 2, math.inf)
+    share = own / (own + sampling)
+    return np.nan_to_num(share * np.nan_to_num(known[:, 0] - 1.0)), np.sqrt(np.nan_to_num(share * sampling))
 
 
 def _scatter(ratios: Sequence[tuple[float, float]], degrees: int) -> float:
@@ -973,9 +1029,14 @@ def _scatter_of_series(ratios: Sequence[tuple[float, float]], degrees: int) -> f
         ratios: noise of each series over the fitted, and its standard deviation by sampling.
         degrees: series less what was fitted to them.
     """
+    return _wanted_by(ratios, degrees) if series_differ(ratios, degrees) else 0.0
+
+
+def _wanted_by(ratios: Sequence[tuple[float, float]], degrees: int) -> float:
+    """Relative variance besides sampling that makes chi-square what it should be, 0 where it is no larger; arguments as above."""
     from scipy.optimize import brentq
 
-    if not series_differ(ratios, degrees):
+    if degrees < 1 or _scatter(ratios, degrees) <= 1.0:
         return 0.0
     known = np.array([one for one in ratios if math.isfinite(one[0])]).reshape(-1, 2)
     square, sampling = (known[:, 0] - 1.0) ** 2, known[:, 1] ** 2

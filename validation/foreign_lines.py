@@ -98,7 +98,7 @@ SETTINGS = (
 PIXEL_MM, DISTANCE_MM = 0.15, 1059.0
 LEVEL_SAMPLING, SLOPE_SAMPLING, GAIN_SAMPLING = 0.0005, 0.004, 0.01  # relative sd that 100 frames of a small panel give
 REPEATS = 0.001  # relative sd of a line's output between series
-SHARE = 0.4  # photon-transfer slope over gain
+SHARE = 0.4  # photon-transfer slope over gain; of a counter 1: a pixel's counts have the variance of their mean
 Z95 = 1.959964
 # Light for each keV of stopped electrons against their energy (keV), rounded from published curves of CsI(Tl): a broad
 # maximum between 8 and 20 keV, some 15 % above the light at 662 keV, and a steep fall below 3 keV
@@ -353,17 +353,22 @@ def truth_of(line: ForeignLine, kV: float, layers: str) -> dict[str, float]:
     }
 
 
+def share_of(line: ForeignLine) -> float:
+    """Photon-transfer slope over gain."""
+    return 1.0 if line.threshold_keV else SHARE
+
+
 def measured_twin(line: ForeignLine, beams: tuple[tuple[float, str], ...], rng: np.random.Generator) -> Twin:
     """A twin calibrated from levels and gains of some beams, with noise."""
     instrument = line.instrument()
     factor = geometry_factor(source_detector_mm=DISTANCE_MM, pixel_mm=PIXEL_MM)
-    levels, points = [], []
+    levels, points, share = [], [], share_of(line)
     common = math.exp(GAIN_SAMPLING * rng.standard_normal())  # of the spread, which all gains share
     for kV, layers in beams:
         exact = truth_of(line, kV, layers)
         rate = exact["rate"] * factor * math.exp(math.hypot(LEVEL_SAMPLING, REPEATS) * rng.standard_normal())
-        slope = SHARE * exact["gain"] * math.exp(SLOPE_SAMPLING * rng.standard_normal())
-        gain = slope / SHARE * common
+        slope = share * exact["gain"] * math.exp(SLOPE_SAMPLING * rng.standard_normal())
+        gain = slope / share * common
         levels.append(
             Level(
                 kV=kV,
@@ -481,7 +486,7 @@ def run_line(job: tuple[str, int, tuple[str, ...]]) -> dict[str, Any]:
             mean = truth["rate"] * factor * 0.01
             exact = {
                 "mean_DN": mean,
-                "sd_DN": math.sqrt(SHARE * truth["gain"] * mean),
+                "sd_DN": math.sqrt(share_of(line) * truth["gain"] * mean),
                 "air_kerma_uGy": truth["kerma"] * (1000.0 / DISTANCE_MM) ** 2 * 0.01,
             }
             row["settings"].append(

@@ -131,8 +131,8 @@ def _detection(row: Row, required: float) -> Criterion:
         value, bound, low = row["a90"], row["a90_upper"], row["a90_low"]
         failed = low is not None and low > required
         if value is None:
-            # no a90 within the objects: the band of the curve says whether the object asked for is found often enough
-            failed = _highest_pod(row["line"], required) < _POD
+            # no a90 within the objects: the curve's band, or the objects themselves, say whether what is asked for is found
+            failed = min(_highest_pod(row["line"], required), _highest_rate(row["points"], required)) < _POD
         met = bound is not None and bound <= required
         return _criterion("detection", required, value, bound, met, failed, _left(bound, required))
     expected: Mapping[str, float] | None = row.get("predicted")
@@ -159,6 +159,15 @@ def _highest_pod(line: Mapping[str, Any] | None, size: float) -> float:
     place = next(number for number, one in enumerate(line["size"]) if one >= size)
     # the band rises with size: the end at the next point is the larger one
     return 1.0 if line["high"][place] is None else float(line["high"][place])
+
+
+def _highest_rate(points: Sequence[Mapping[str, Any]], size: float) -> float:
+    """Upper 95 % bound of the share of objects of a size or larger that any network finds, which no POD at that size exceeds.
+
+    Objects of the same size count as one.
+    """
+    found = [point["hits"] > 0 for point in points if point["size"] >= size]
+    return upper_rate(sum(found) / len(found), float(len(found))) if found else 1.0
 
 
 def _false_alarms(row: Row, required: float) -> Criterion:

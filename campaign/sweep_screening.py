@@ -244,11 +244,13 @@ class Screen:
         self.texture: ProductTexture | None = texture
         self.largest = float(objects.size.max())
         own = self.line.twin.instrument.source_detector_mm
-        self._pairs = {
+        pairs = {
             one.text: (_at_own_distance(one.pair[0], own), _at_own_distance(one.pair[1], own))
             for one in outlooks
             if one.feasible and all(setting.binning == 1 for setting in one.pair)
         }
+        against = self.line.reasons_against(list(pairs.values()), objects)
+        self._pairs = {text: pair for (text, pair), reason in zip(pairs.items(), against, strict=True) if not reason}
         self.kept = [one.text for one in outlooks if one.kept]
         self._sizes: dict[str, float] = {}
 

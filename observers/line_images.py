@@ -30,7 +30,8 @@ from ..generator.line.binning import refuse_binning
 from ..generator.line.line_limits import broken_limits
 from ..generator.line.spectral_signal import OpenBeam, SpectralModel
 from ..generator.line.twin import Twin
-from ..generator.line.twin_spectrum import spectral_model_of, white_gain_DN
+from ..generator.line.twin_spectrum import slope_share, spectral_model_of, white_gain_DN
+from ..generator.predictions.contrast import FEW_PHOTONS
 from ..generator.predictions.predict import saturation_text
 from ..generator.predictions.predict_many import Levels, predict_levels
 from ..generator.spread.psf import whole_spectrum
@@ -244,22 +245,45 @@ class LineImages:
             source_detector_mm=distance.pop(),
         )
 
-    def reasons_against(self, pairs: Sequence[Pair]) -> tuple[str, ...]:
-        """Why images at each pair (pair,) cannot be taken; empty: they can.
+    def reasons_against(self, pairs: Sequence[Pair], objects: ForeignObjects) -> tuple[str, ...]:
+        """Why nothing can be said of images at each pair (pair,); empty: it can.
 
-        A limit of tube, readout or belt is broken, or the open field, which every image is divided by, saturates.
+        A limit of tube, readout or belt is broken; the open field, which every image is divided by, saturates; or a pixel
+        behind the product (the median of the objects') holds so little signal that its logarithm is no straight one.
         """
         reasons = [""] * len(pairs)
         for side in (0, 1):
             settings = [pair[side] for pair in pairs]
-            for number, (one, mean_DN) in enumerate(zip(settings, self._levels(settings).mean_DN, strict=True)):
+            levels = self._levels(settings)
+            for number, one in enumerate(settings):
+                mean_DN, gain_DN = float(levels.mean_DN[number]), float(levels.gain_DN[number])
                 broken = broken_limits(self.twin.instrument, one)
-                saturated = saturation_text(self.twin, one, float(mean_DN))
+                saturated = saturation_text(self.twin, one, mean_DN)
                 if broken:
-                    reasons[number] = reasons[number] or str(broken[0])
+                    found = str(broken[0])
                 elif saturated:
-                    reasons[number] = reasons[number] or f"open field at {one}: {saturated}"
+                    found = f"open field at {one}: {saturated}"
+                elif self._noise_behind(one, mean_DN, gain_DN, objects) > FEW_PHOTONS:
+                    found = (
+                        f"a pixel behind the product at {one} is noisier than {100 * FEW_PHOTONS:.0f} %: its logarithm is biased,"
+                        " and no a90 follows from noise that is added to it"
+                    )
+                else:
+                    continue
+                reasons[number] = reasons[number] or found
         return tuple(reasons)
+
+    def _noise_behind(self, setting: Setting, mean_DN: float, gain_DN: float, objects: ForeignObjects) -> float:
+        """Relative standard deviation of a pixel's signal behind the product; infinite where the open field has none."""
+        thickness = np.array([float(np.median(objects.product_mm))])
+        log_image, ratio = self._behind(setting, [(objects.product_material, thickness)])
+        signal_DN = mean_DN * math.exp(-float(log_image[0]))
+        if not signal_DN > 0:
+            return math.inf
+        variance_DN2 = (
+            gain_DN * float(ratio[0]) * slope_share(self.twin) * signal_DN + self.twin.noise.read_variance_DN2
+        )
+        return math.sqrt(variance_DN2 / setting.averaged) / signal_DN
 
     def pair_images(self, pairs: Sequence[Pair], objects: ForeignObjects, *, image: str = "residual") -> PairImages:
         """Signals and noise of one combined image at every pair of settings; see the module.

@@ -40,6 +40,7 @@ def row(a90=1.5, *, upper=1.8, low=1.2, alarms=0.0, looks=400.0, pace=1.5, dose=
         "a90_upper": upper if trained else None,
         "objects": 60,
         "line": None,
+        "points": [],
         "predicted": None,
         "false_alarm_rate": {"value": alarms, "low": max(alarms - spread, 0.0), "high": alarms + spread}
         | {"n": int(looks), "effective_n": looks}
@@ -69,6 +70,14 @@ def test_a_setting_meets_what_its_bounds_show():
     assert margins["detection"] == pytest.approx(0.1)
     assert margins["throughput"] == pytest.approx(0.5)
     assert margins["dose"] == pytest.approx(1 - 2.6 / 3)
+
+
+@pytest.mark.parametrize(
+    ("missed", "verdict"), [((1.0, 1.5), "open"), ((2.0,), "open"), ((2.0, 2.2, 2.5, 3.0), "fails")]
+)
+def test_objects_that_nobody_finds_rule_a_size_out_where_no_curve_can(missed, verdict):
+    points = [{"size": size, "hits": 0, "n": 3} for size in missed]
+    assert verdicts(row(None, upper=None, low=None, points=points))[1]["detection"] == verdict
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 from raytwin.diagnosis.model.changes import READ_TEXTURE_SD
 from raytwin.diagnosis.probes.fixed_pattern import pattern_statistics
 from raytwin.diagnosis.probes.line_scalars import LineNoise, bent_share, line_pattern, of_mean
+from raytwin.diagnosis.probes.probes import noise_name
 from raytwin.diagnosis.probes.scalar_context import Areas
 from raytwin.diagnosis.problem.nuisance_columns import _read_texture
 from raytwin.generator.line.line_state import EACH_LINE, LineFlicker
@@ -126,8 +127,12 @@ def test_read_noise_that_neighbours_share_moves_their_correlation_lines_and_bloc
     down, right = lag
     here = frames[:, : SHAPE[0] - down, max(-right, 0) : SHAPE[1] - max(right, 0)]
     there = frames[:, down:, max(right, 0) : SHAPE[1] + min(right, 0)]
-    own, other = f"correlation field ({down},{right})", "correlation field (0,2)"
-    names = [*lines, own, other]
+    own, other = noise_name("field", lag), noise_name("field", (0, 2))
+    scalars = [
+        *(SimpleNamespace(name=name, label="", lag=None) for name in lines),
+        SimpleNamespace(name=own, label="field", lag=lag),
+        SimpleNamespace(name=other, label="field", lag=(0, 2)),
+    ]
     context = SimpleNamespace(
         areas=Areas.of(np.ones(SHAPE, dtype=bool), np.zeros(SHAPE, np.int64), 1),
         label_names=("field",),
@@ -135,10 +140,9 @@ def test_read_noise_that_neighbours_share_moves_their_correlation_lines_and_bloc
     )
     expected = SimpleNamespace(quantum_variance_DN2=np.full((1, 1), quanta), white_variance_DN2=np.full((1, 1), white))
     series = SimpleNamespace(expected=expected, context=context, scalars=dict.fromkeys(lines, 0.0))
-    probes = SimpleNamespace(
-        series=series, of_scalars=lambda change: np.array([change(SimpleNamespace(name=name)) for name in names])
-    )
-    found = dict(zip(names, _read_texture(probes, lag) * rho / READ_TEXTURE_SD, strict=True))
+    probes = SimpleNamespace(series=series, of_scalars=lambda change: np.array([change(one) for one in scalars]))
+    moved_by = _read_texture(probes, lag) * rho / READ_TEXTURE_SD
+    found = {one.name: value for one, value in zip(scalars, moved_by, strict=True)}
     for name, ratio in lines.items():
         assert ratio - 1.0 == pytest.approx(found[name], abs=0.04)
     assert np.mean(here * there) / total == pytest.approx(found[own], abs=0.005)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from raytwin.acquisition.setting import setting_from_text
+from raytwin.diagnosis.probes.probes import noise_name
 from raytwin.diagnosis.probes.scalar_context import Areas
 from raytwin.diagnosis.problem.nuisance_columns import brighter
 from raytwin.diagnosis.problem.output_course import OutputCourse, rms_about_mean
@@ -90,7 +91,8 @@ def test_more_light_has_the_noise_of_more_quanta():
 
     dim, lit = variances(signal), variances((1.0 + more) * signal)
     labels = (np.arange(50) >= 25).astype(np.int64) * np.ones((40, 1), np.int64)
-    names = ("log_variance bright", "log_variance dim", "frame_factor")
+    scalars = [SimpleNamespace(name=noise_name(label), label=label, lag=None) for label in ("bright", "dim")]
+    scalars.append(SimpleNamespace(name="frame_factor", label="", lag=None))
     series = SimpleNamespace(
         expected=SimpleNamespace(quantum_variance_DN2=gain * signal, white_variance_DN2=np.full((1, 1), white)),
         context=SimpleNamespace(areas=Areas.of(np.ones(shape, dtype=bool), labels, 2), label_names=("bright", "dim")),
@@ -98,7 +100,7 @@ def test_more_light_has_the_noise_of_more_quanta():
     probes = SimpleNamespace(
         series=series,
         of_maps=lambda images: np.pad(images.mean(axis=(1, 2))[:, None], ((0, 0), (0, 3))),
-        of_scalars=lambda change: np.array([0.0, *(change(SimpleNamespace(name=name)) for name in names)]),
+        of_scalars=lambda change: np.array([0.0, *(change(one) for one in scalars)]),
     )
     level, bright, faint, steps = 100.0 * more * brighter(probes, signal)
     assert level == pytest.approx(more * signal.mean())

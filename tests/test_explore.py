@@ -154,6 +154,8 @@ def test_limits_that_are_broken_are_said_and_numbers_stay(explorer: Explorer, st
     assert [text for text in bright.limits if re.match(r"90 kV: the detector saturates: \d+ DN above dark", text)]
     assert bright.high.full_scale_share is not None and bright.high.full_scale_share > 1
     assert not set(bright.cautions) & set(bright.limits)
+    assert bright.seen_size is not None and bright.seen_size.a90_mm is None and bright.seen_size.pod is None
+    assert "saturates" in bright.seen_size.reason
     with pytest.raises(InputError, match=r"at most the tube's 90 W"):
         explorer.twin.predict(kV=90, power_W=130, exposure_ms=20)
 

@@ -351,6 +351,12 @@ def test_a_setting_that_the_line_cannot_have_gets_no_number(line, make_model_twi
     assert all(math.isnan(one) for one in found.pod[1])
     assert sum("saturates" in text for text in found.warnings) == 1
     assert not any("outside the calibrated range" in text for text in found.warnings)
+    # next to no light: the logarithm of a pixel is no straight one, and noise added to it tells nothing
+    dim = rt.observe(line.twin, [pair_at(0.2), pair_at(20)], **words)
+    assert dim.rows[0]["a90"] is None and dim.rows[1]["a90"] is not None
+    assert sum("noisier than 30 %" in text for text in dim.warnings) == 1
+    # nothing is larger than the field
+    assert max(dim.sizes) == pytest.approx(min(line.twin.maps.shape) * line.object_pixel_mm)
     beyond = rt.observe(line.twin, pair_at(5, kV=(40, 120)), **words)
     (told,) = (text for text in beyond.warnings if "outside the calibrated range" in text)
     assert told.startswith("kv=120") and "kV (" in told

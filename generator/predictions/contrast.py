@@ -49,7 +49,7 @@ MAXIMUM_SPREAD_PX = 50.0
 # a wider ring adds no noise worth its computation
 _WIDEST_RING_PX = 500
 # above this relative noise of a pixel's signal, -ln is no longer straight over the noise
-_FEW_PHOTONS = 0.3
+FEW_PHOTONS = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -487,7 +487,7 @@ def _slabs(
         white_object=white[1],
         thin_mu_product_per_mm=crossed.thin_mu_product_per_mm,
         thin_mu_object_per_mm=crossed.thin_mu_object_per_mm,
-        few_photons=math.sqrt(max(spreads) * setting.averaged) > _FEW_PHOTONS,
+        few_photons=math.sqrt(max(spreads) * setting.averaged) > FEW_PHOTONS,
         saturated=beam.saturated,
         warnings=beam.warnings,
     )
@@ -599,7 +599,7 @@ def _combined(
     warnings = list(dict.fromkeys((*low.warnings, *high.warnings)))
     if low.few_photons or high.few_photons:
         warnings.append(
-            f"a pixel's signal behind the object is noisier than {100 * _FEW_PHOTONS:.0f} %: its logarithm is biased and"
+            f"a pixel's signal behind the object is noisier than {100 * FEW_PHOTONS:.0f} %: its logarithm is biased and"
             " the noise given here is too small"
         )
     if low.channel.M_product < PRODUCT_THRESHOLD:

@@ -117,6 +117,11 @@ class Predictions(Result):
     def __getitem__(self, number: int) -> Prediction:
         return self.predictions[number]
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Those of all predictions, each once."""
+        return tuple(dict.fromkeys(line for item in self.predictions for line in item.warnings))
+
     def to_dict(self) -> dict[str, Any]:
         """`{"predictions": [...]}`, each as `raytwin predict --json` prints it."""
         return {"predictions": [item.to_dict() for item in self.predictions]}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..acquisition.setting import Filter, Setting, filter_from_text, text_from_filters
 from ..errors import InputError, check_number
-from ..materials import Library, library_from_files, material_from_name, nist_identifier
+from ..materials import TABLES, Library, library_from_files, material_from_name, nist_identifier
 from ..results import Result, Table, axes_or_new, frame, interval_text, number_text, plain
 from ._given import PathLike, as_any_twin
 from ._progress import Progress, Telling
@@ -420,6 +420,8 @@ def _beam(
         tube_spectrum,
     )
 
+    if table not in TABLES:
+        raise InputError("table", received=repr(table), expected=f"one of {', '.join(TABLES)}")
     layers = as_layers(filters, library)
     if spectrum_file is not None:
         return filtered_spectrum(spectrum_from_file(spectrum_file, kV=kV), layers, table=table, library=library)
@@ -460,7 +462,7 @@ def spectrum(
         anode_angle_deg: 1 to 60 degrees; None: 12.
         model: SpekPy's, `casim` or `kqp`; None: `casim`.
         spectrum_file: a measured spectrum (two columns: keV, fluence) in place of the tube.
-        table: attenuation data, `xraylib`, `chantler` or `spekpy`.
+        table: attenuation data, `xraylib`, `chantler` or `penelope`.
         library: files of your own materials (TOML).
 
     Returns:

@@ -159,8 +159,8 @@ def observe(
     A linear observer reads them off the twin: the object's signal in the log images, the noise of quanta and electronics with its
     correlations, the belt's motion, and a threshold for a search of the whole image. Without `calibrated` it is the detector itself:
     an order of settings, and what signal and noise allow in its image. With it, a90 is what networks as in the calibration reach,
-    with a 95 % interval. Scatter and effects in images are left out. A setting that the line cannot have, or whose open field
-    saturates, gets no number; `warnings` say why.
+    with a 95 % interval. Scatter and effects in images are left out. A setting that the line cannot have, whose open field
+    saturates, or that leaves too little light behind the product gets no number; `warnings` say why.
 
     Args:
         twin: a calibrated line with a spectral part.
@@ -168,7 +168,7 @@ def observe(
         product, foreign_object: a shape in a slab: `"chicken_breast:20"`, and the material of the object.
         shape, width, height, height_mm: `ellipsoid`, `rod` or `plate`, its length being the size; width and height (along the
             beam) of the length, or height_mm the same at every size.
-        sizes_mm: lengths to look at; None: from half a pixel to 120 pixels.
+        sizes_mm: lengths to look at; None: from half a pixel to 120 pixels or the field's shorter side.
         displaces: the shape takes the product's place.
         references: in place of a shape: a dataset of low-noise images, whose objects are looked for (they take the product's place).
         product_material, foreign_material, size: of the references; size is `contrast` or `size_mm`.
@@ -240,7 +240,7 @@ def observe(
         )
     found = observe_settings(line, pairs, objects, observer=observer, texture=texture)
     expected = None if efficiency is None else predicted_sizes(line, pairs, objects, efficiency, texture=texture)
-    against = line.reasons_against(pairs)
+    against = line.reasons_against(pairs, objects)
     warnings = [*line.warnings, *(reason for reason in against if reason), *_outside(line, pairs)]
     largest = float(objects.size.max())
     if efficiency is None:
@@ -444,7 +444,7 @@ def _objects_of_shape(
     shape = Shape(**words)
     pitch = line.object_pixel_mm
     if sizes_mm is None:
-        largest = _LARGEST_PX * pitch
+        largest = min(_LARGEST_PX, *line.twin.maps.shape) * pitch  # no object is larger than the field
         if displaces and shape.height_mm is None:
             largest = min(largest, slab.thickness_mm / shape.height)
         sizes_mm = np.geomspace(_SMALLEST_PX * pitch, largest, _SIZES).tolist()

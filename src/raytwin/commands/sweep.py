@@ -152,7 +152,20 @@ def _plan_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         expected = row["predicted"] or {}
         ends = [_shown(expected.get(name)) for name in ("value", "low", "high")] if seen else []
         body.append([str(row["label"]), *_costs(row), *ends])
-    return _table(header, body, [_note(row, []) for row in rows])
+    return [*_table(header, body, [_note(row, []) for row in rows]), *_warning_lines(rows)]
+
+
+def _warning_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Each warning once, with the first of the feasible settings that it is of and how many more there are."""
+    of: dict[str, list[str]] = {}
+    for row in rows:
+        if row["feasible"]:
+            for text in row["warnings"]:
+                of.setdefault(str(text), []).append(str(row["label"]))
+    return [
+        f"warning: {labels[0]}{f' and {len(labels) - 1} more' if len(labels) > 1 else ''}: {text}"
+        for text, labels in of.items()
+    ]
 
 
 def _note(row: Mapping[str, Any], marks: Sequence[str]) -> str:

@@ -550,6 +550,8 @@ def _a90_text(known: Any) -> str:
 def _seen_size_rows(seen: SeenSize) -> list[tuple[str, str]]:
     """What model observers find, as titles and texts."""
     diameter = f"none up to {seen.largest_mm:.3g} mm" if seen.a90_mm is None else f"{seen.a90_mm:.3g} mm across"
+    if seen.reason:
+        diameter = f"none: {html.escape(seen.reason)}"
     if seen.pod is not None:
         diameter += f"; POD of the disc shown {100 * seen.pod if seen.pod > _NEXT_TO_NONE else 0:.3g} %"
     rows = [(f"a90 of an ideal observer, {100 * seen.false_alarm_rate:g} % false alarms", diameter)]

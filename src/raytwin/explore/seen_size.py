@@ -38,7 +38,8 @@ class SeenSize:
 
     Fields: a90_mm (diameter in the object's plane that the ideal observer finds in 90 % of cases; None: none of those asked for);
     largest_mm (asked for); pod (of the disc that is shown; None outside these); false_alarm_rate (of the ideal
-    observer); networks (a90 of networks, of the calibrated observer's size; None without one); size_name (of it).
+    observer); networks (a90 of networks, of the calibrated observer's size; None without one); size_name (of it); reason (why
+    nothing is said; empty: something is).
     """
 
     a90_mm: float | None
@@ -47,6 +48,7 @@ class SeenSize:
     false_alarm_rate: float
     networks: Estimate | None = None
     size_name: str = ""
+    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,6 +138,17 @@ class Eye:
             foreign_material=state.foreign_object.material,
             displaces=state.displaces,
         )
+        (against,) = self._line.reasons_against([pair], discs)
+        size_name = "" if self._networks is None else self._networks.efficiency.size_name
+        if against:
+            return SeenSize(
+                a90_mm=None,
+                largest_mm=self._sizes_mm[-1],
+                pod=None,
+                false_alarm_rate=self._observer.false_alarm_rate,
+                size_name=size_name,
+                reason=against,
+            )
         found = observe_settings(self._line, [pair], discs, observer=self._observer)
         a90 = float(found.a90[0])
         sizes = self._sizes_mm
@@ -156,7 +169,7 @@ class Eye:
             pod=pod,
             false_alarm_rate=self._observer.false_alarm_rate,
             networks=networks,
-            size_name="" if self._networks is None else self._networks.efficiency.size_name,
+            size_name=size_name,
         )
 
 

@@ -31,13 +31,17 @@ class Explained:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Label:
-    """What a series says of its beam: kV, filters, (name, value) of the tube load, exposure and distance."""
+    """What a series says of its beam: kV, filters, (name, value) of the tube load, exposure and distance.
+
+    electronic_gain: of the readout over that of the other series, which no label states.
+    """
 
     kV: float | None
     filters: tuple[Filter, ...]
     load: tuple[str, float] | None
     exposure_ms: float | None
     distance_mm: float
+    electronic_gain: float = 1.0
 
     @property
     def beam(self) -> tuple[object, ...]:

@@ -10,8 +10,9 @@ declared instrument gives for the labels:
     attenuation  all (0.1) + placement of a scene (0.3) + series (0.12)
 
 wide enough for every effect of the catalogue within its plausible range. The tube's inherent filtration is that with which the
-labels fit best, or what is expected of tubes. A labelling in which series take the kV, filters, exposure
-or whole setting of others, or two series change places, must be better by `LEAST_EVIDENCE` (natural logarithm).
+labels fit best, or what is expected of tubes. A labelling in which series take the kV, filters, exposure or whole setting of
+others, two series change places, or some were read at another gain of the electronics (which scales level and noise over signal
+alike), must be better by `LEAST_EVIDENCE` (natural logarithm).
 
 Validity: needs several series; a session whose labels are all wrong in the same way is consistent.
 """
@@ -50,6 +51,15 @@ _THINGS: dict[str, tuple[str, ...]] = {
     "exposure time": ("exposure_ms",),
     "tube load": ("load",),
     "setting": ("kV", "load", "exposure_ms", "filters"),
+}
+# powers of two: feedback capacitors and pixel binning are switched so
+_ELECTRONIC_GAINS = {
+    0.125: "an eighth of",
+    0.25: "a quarter of",
+    0.5: "half",
+    2.0: "twice",
+    4.0: "four times",
+    8.0: "eight times",
 }
 _Covariance = Callable[[Sequence[int], Sequence[Label]], FloatArray]
 
@@ -95,7 +105,11 @@ def relabelled(judged: Sequence[Reading], maps: LabelModel) -> list[Finding]:
         doubtful = sorted((i for i, z in strange.items() if z > _DOUBTFUL_Z), key=lambda i: -strange[i])[
             :_MOST_DOUBTFUL
         ]
-        candidates = [*_exchanged_groups(labels, kinds), *_candidates(doubtful, labels, names)]
+        candidates = [
+            *_exchanged_groups(labels, kinds),
+            *_candidates(doubtful, labels, names),
+            *_other_gains(doubtful, labels),
+        ]
         gains = [
             max(evidence(candidate.labels, one) for one in tubes) - current - candidate.price
             for candidate in candidates
@@ -200,10 +214,13 @@ def _features(judged: Sequence[Reading], maps: LabelModel) -> list[_Feature]:
         # the deepest parts are where scatter fills in: the median weighs them no more than others
         return 0.0 if depth is None else math.log(max(float(np.median(depth[covered[index]])), 1e-3))
 
+    def of_readout(label: Label) -> float:
+        return math.log(label.electronic_gain)
+
     features = []
     for numbers, expected, covariance in (
-        (_levels(judged, maps), lambda _, label, mm_Al: maps.log_level(label, mm_Al), of_levels),
-        (_gains(judged), lambda _, label, mm_Al: maps.log_gain(label, mm_Al), of_gains),
+        (_levels(judged, maps), lambda _, label, mm_Al: maps.log_level(label, mm_Al) + of_readout(label), of_levels),
+        (_gains(judged), lambda _, label, mm_Al: maps.log_gain(label, mm_Al) + of_readout(label), of_gains),
         (depths, attenuation, of_attenuations),
     ):
         if len(numbers) > 1:
@@ -310,6 +327,25 @@ def _candidates(doubtful: Sequence[int], labels: Sequence[Label], names: Sequenc
                 changed[other] = _takes(labels[other], what, labels[index])
                 seen = f"its {what} ({values[index]}) and that of {names[other]} ({values[other]}) were exchanged"
                 result.append(_Relabelling(price, changed, (index, other), "looks as if", seen))
+    return result
+
+
+def _other_gains(doubtful: Sequence[int], labels: Sequence[Label]) -> list[_Relabelling]:
+    """Labellings in which a doubtful series, or all of its tube voltage, was read at another gain of the electronics."""
+    groups: set[tuple[int, ...]] = {(index,) for index in doubtful}
+    groups |= {
+        tuple(number for number, label in enumerate(labels) if label.kV == labels[index].kV) for index in doubtful
+    }
+    result: list[_Relabelling] = []
+    for members in sorted(groups):
+        if len(members) == len(labels):
+            continue
+        for factor, word in _ELECTRONIC_GAINS.items():
+            changed = list(labels)
+            for index in members:
+                changed[index] = replace(labels[index], electronic_gain=factor * labels[index].electronic_gain)
+            seen = f"read at {word} the electronic gain of the other series (gain mode, binning)"
+            result.append(_Relabelling(_PRICE_OF_A_SETTING, changed, members, "looks", seen))
     return result
 
 

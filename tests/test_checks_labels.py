@@ -80,6 +80,17 @@ def label(name, **attributes):
     return lambda file: file["series"][name].attrs.update(attributes)
 
 
+def read_at(gain, name):
+    """Frames as electronics of another gain give them: the converter's pedestal stays."""
+
+    def change(file):
+        pedestal = file["series"]["dark_25ms"]["frames"][:].mean(axis=0)
+        frames = file["series"][name]["frames"]
+        frames[:] = np.clip(np.round(pedestal + gain * (frames[:] - pedestal)), 0, 65535).astype(frames.dtype)
+
+    return change
+
+
 def exchange_everywhere(*kinds):
     def change(file):
         for node in file["series"].values():
@@ -230,6 +241,8 @@ def test_effects_at_the_end_of_their_range_are_not_taken_for_wrong_labels(tmp_pa
         (exchange_everywhere("object"), None, "exchanged in all objects"),
         (label(f"{FLAT_40}_2", filter="Cu:0.2"), {f"{FLAT_40}_2"}, "looks like Cu:0.05 or 100 ms (labelled Cu:0.2)"),
         (label(f"{FLAT_40}_2", exposure_ms=100.0), {f"{FLAT_40}_2"}, "looks like 25 ms (labelled 100 ms)"),
+        (read_at(0.5, f"{FLAT_90}_2"), {f"{FLAT_90}_2"}, "read at half the electronic gain of the other series"),
+        (read_at(2.0, f"{FLAT_40}_2"), {f"{FLAT_40}_2"}, "read at twice the electronic gain of the other series"),
         (
             label("dark_25ms_2", kind="flat", kV=40.0, power_W=82.0, filter="Cu:0.05"),
             {"dark_25ms_2"},

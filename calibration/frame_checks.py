@@ -72,7 +72,8 @@ def repeated_frame_indices(pieces: Iterable[NDArray[Any]]) -> tuple[int, ...]:
 
     A copy equals an earlier frame in every pixel. Two exposures are equal by chance with p^N, N pixels that each repeat
     their number with probability p; p is the share of equal pixels in successive frames that are not copies. Where the
-    expected number of chance copies exceeds `FALSE_ALARM` (frames of nothing but zeros, saturated ones), none is reported.
+    expected number of chance copies exceeds `FALSE_ALARM` (frames of few counts), none is reported, nor where half of a frame's
+    pixels hold its largest number (frames of nothing but zeros, saturated ones).
 
     Args:
         pieces: frames in time order, arrays (m, row, column), DN; read once.
@@ -109,7 +110,7 @@ class CopyScan:
         self._digests: list[bytes] = []
         self._equal = self._compared = 0
         self._last: NDArray[Any] | None = None
-        self._constant: list[bool] = []
+        self._saturated: list[bool] = []
         self._pixels = 0
 
     @property
@@ -125,7 +126,8 @@ class CopyScan:
             self._pixels = values.size
             step = max(1, values.size // _KEPT_PIXELS)
             kept = values.reshape(-1)[::step].copy()
-            self._constant.append(bool((kept == kept[0]).all()) and bool((values == values.flat[0]).all()))
+            # half of the pixels at the largest number: saturated, and the rest are defects that may never change
+            self._saturated.append(bool(np.median(kept) == kept.max()) and bool(np.median(values) == values.max()))
             if self._last is not None and self._digests[-1] != self._digests[-2]:
                 self._equal += int(np.count_nonzero(kept == self._last))
                 self._compared += kept.size
@@ -137,7 +139,7 @@ class CopyScan:
         found = {}
         for index, digest in enumerate(self._digests):
             origin = first.setdefault(digest, index)
-            if origin != index and not self._constant[index]:
+            if origin != index and not self._saturated[index]:
                 found[index] = origin
         if not found:
             return found

@@ -43,6 +43,12 @@ def test_copies_are_found_wherever_they_stand_and_in_whatever_pieces():
     assert repeated_frame_indices([frames]) == ()
 
 
+def test_saturated_frames_with_a_few_dead_pixels_are_no_copies():
+    frames = np.full((8, 32, 32), 16383, dtype=np.uint16)
+    frames[:, ::7, ::9] = 12
+    assert repeated_frame_indices([frames]) == ()
+
+
 def test_frames_that_are_equal_by_chance_are_no_copies():
     rng = np.random.default_rng(1)
     assert repeated_frame_indices([np.zeros((5, 8, 8), np.uint16)]) == ()

@@ -28,7 +28,7 @@ _LEAST_FRAMES = 6  # half of the lags show what noise is once nothing is shared
 _MOST_FRAMES = 48
 _SIDE_PX = 256  # around the middle: more pixels add nothing to what frames share
 _TILES = 4  # along each side of that, whose scatter is the sampling noise
-_BEYOND_CHANCE = 3.3  # standard errors: 1 in 1000 of a normal number, 5 in 1000 where 16 tiles tell the error (Student)
+_BEYOND_CHANCE = 4.07  # standard errors: 1 in 1000 of Student's t, as 16 tiles tell the error
 
 FloatArray = NDArray[np.float64]
 

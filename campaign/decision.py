@@ -373,7 +373,8 @@ def criterion_text(one: Criterion, *, unit: str) -> str:
     if one.bound is None:
         return f"{name}: a90 {shown(one.value or 0.0)} without an upper bound, asked for {asked}"
     what = ": a90 expected up to" if one.predicted else ": a90 at most" if one.name == "detection" else " at most"
-    margin = "" if one.margin is None else f" ({_margin_text(one.margin)})"
+    open_yet = one.verdict == OPEN and (one.margin or 0.0) < 0
+    margin = "" if one.margin is None else f" ({'not shown yet' if open_yet else _margin_text(one.margin)})"
     return f"{name}{what} {shown(one.bound)}, asked for {asked}{margin}"
 
 
@@ -415,7 +416,7 @@ def decision_sentence(
     )
     state = f" and fails in {failed}" if failed else ""
     state += f"; not yet known: {unknown}" if unknown else ""
-    return f"{asked} {tally} {recommended.label} comes closest{state}. It has {facts}."
+    return f"{asked} {tally} {recommended.label} comes closest{state}. What is known of it: {facts}."
 
 
 # ---------------------------------------------------------------------------------------------------- the whole

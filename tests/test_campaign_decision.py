@@ -198,7 +198,10 @@ def test_where_nothing_meets_it_the_closest_is_named_with_what_is_missing():
     judged = [judge_row(rows[0], ASKED)]
     text = decide(rows, ASKED, judged, recommended=0, unit="mm", changes_by="")["sentence"]
     assert "0 meet it, 1 is open" in text and "comes closest; not yet known: detection" in text
-    assert "(5 % too much)" in text
+    assert "a90 at most 2.1 mm, asked for 2 mm (not shown yet)" in text
+    failing = row(2.2, upper=2.5, low=2.1)
+    text = decide([failing], ASKED, [judge_row(failing, ASKED)], recommended=0, unit="mm", changes_by="")["sentence"]
+    assert "fails in detection" in text and "(25 % too much)" in text
     for trained, said in ((False, "None was tried"), (True, "None of the 1 that were tried has an a90")):
         rows = [row(trained=trained)]
         assert said in decide(rows, ASKED, judged, recommended=None, unit="mm", changes_by="")["sentence"]

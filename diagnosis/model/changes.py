@@ -41,9 +41,6 @@ ATTENUATION_OF_BEAM_SD = 0.004  # the part of that which changes with the tube v
 LEVEL_OF_BEAM_SD = 0.003  # of the level of a kV and filter
 OF_BEAMS_GROWS = 2.0  # how much more beams may differ by, over each further prior sd of the largest departure
 LEVEL_OF_SERIES_SD = 0.001  # of the level of one series
-EXPOSURE_SD_MS = (
-    0.02  # of the length of all exposures: resets, shutters and pulses take as long as a line's readout, 10-100 us
-)
 GAIN_OF_BEAM_SD = 0.01  # of the gain of a kV and filter
 GAIN_EXPONENT_SD = 0.5  # of the power of a pixel's gain with which its quantum noise grows: 1 to 2
 POSITION_SD_PX = 0.15  # of a scene against its thickness maps

@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ...calibration.setting_errors import EXPOSURE_SD_MS
 from ...generator.frames.declared_spot import declared_spot_px
 from ...generator.line.line_state import TilePattern
 from ..model import changes as scales
@@ -182,7 +183,7 @@ def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: fl
         f"level of {item.name}": scales.LEVEL_OF_SERIES_SD * signal,
     }
     if item.request.exposure_ms > 0:
-        images["length of exposures"] = scales.EXPOSURE_SD_MS / item.request.exposure_ms * signal
+        images["length of exposures"] = EXPOSURE_SD_MS / item.request.exposure_ms * signal
     for number, shape in enumerate(_shapes(signal.shape)):
         changed = shape * signal
         images[f"shape {number} of {item.name}"] = changed

@@ -90,7 +90,8 @@ def allowing_for_settings(
         np.mean([rate_changes(point_of[name].exposure_ms, level.source_detector_mm) for name in level.series], axis=0)
         for level in levels
     ]
-    middle = np.mean(changes, axis=0)
+    lit = [change for level, change in zip(levels, changes, strict=True) if level.rate_DN_per_mAs is not None]
+    middle = np.mean(lit, axis=0) if lit else np.zeros(2)
     result = []
     for level, change in zip(levels, changes, strict=True):
         rate = level.rate_DN_per_mAs

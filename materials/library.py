@@ -273,5 +273,5 @@ def _unknown(name: str, library: Library) -> InputError:
         "material",
         received=repr(name),
         expected="an id or alias of the library, an element symbol, FORMULA@DENSITY (g/cm3) or a NIST compound's name",
-        remedy=remedy or "see materials/library.toml for the ids",
+        remedy=remedy or f"ids of the library: {', '.join(library.materials)}",
     )

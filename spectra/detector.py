@@ -182,7 +182,7 @@ def counted_fraction(
 
     Args:
         energies_keV: (n,) photon energies.
-        threshold_keV: (m,) thresholds T; 0 counts every photon that interacts once.
+        threshold_keV: (m,) thresholds T; 0 counts all charge, in each pixel that has some.
         layer: the sensitive layer.
         escape: False leaves the K photons out.
         shared: whether two pixels share every charge.
@@ -221,7 +221,7 @@ def counted_fraction(
     found = kept * counts(energies)
     for line_keV, fraction in escaping:
         found += fraction * counts(energies - line_keV)
-    return np.where(thresholds > 0, found, 1.0)
+    return np.where(thresholds > 0, found, 2.0 if shared else 1.0)
 
 
 def k_escape_fractions(

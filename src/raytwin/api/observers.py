@@ -330,8 +330,9 @@ def calibrate_observer(
         if not rates or not 0 < sum(rates) / len(rates) < 1:
             raise InputError(
                 "false_alarm_rate",
-                received="no rate between 0 and 1 in the sweep",
-                expected="the rate at which its networks alarm, stated",
+                received="a sweep whose networks alarmed at no image without object, or at all",
+                expected="a rate above 0 and below 1",
+                remedy="give false_alarm_rate (--false-alarms), such as 0.01",
             )
         false_alarm_rate = sum(rates) / len(rates)
     line = LineImages(as_twin(twin))

@@ -10,7 +10,7 @@ Files:
     full_scale            series that reach the end of the ADC's range
     flat_levels           each series as photon transfer sees it, the level of each beam, the gain map
     flat_evidence         drift, lag, linearity, repeats, shape of the noise
-    setting_errors        exposures and distances that are not as stated
+    setting_errors        exposures, distances and a response that are not as stated
     noise_power           noise power of one series
     spread_families       forms that the optical spread may have, and how likely each is
     spread_fit            optical spread, gain and read noise from the noise power of all series

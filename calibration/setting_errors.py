@@ -1,7 +1,8 @@
-"""Exposures and distances that are not as stated: what flats of one beam say of their errors.
+"""Exposures and distances that are not as stated, and a response that bends: what flats of one beam say of them.
 
-One error of all exposures and one of all distances: a level goes as (t + dt) / (d + dd)^2. Both are nuisances. What they leave
-open widens levels at other exposures and distances; nothing is corrected, as labels are the user's to put right.
+One error of all exposures, one of all distances, and one bend: a level S goes as (t + dt) / (d + dd)^2 (1 + b S / S_brightest). They
+are nuisances. What they leave open widens levels at other exposures, distances and signals; nothing is corrected, as labels
+are the user's to put right.
 """
 
 import math
@@ -21,18 +22,21 @@ from .flat_levels import SeriesPoint
 EXPOSURE_SD_MS = 0.36
 # relative: 21 CFR 1020.31 (e) allows indicators of the source-image distance 2 %, two standard deviations
 DISTANCE_SD = 0.01
+BEND_SD = 0.005  # at the brightest flat: panels and cameras state 1 % of linearity (EMVA 1288), two standard deviations
+_ROUNDS = 20  # of sizes that are known better each time
 _CLEAR = 3.0  # standard deviations: one line in 400 is told without cause
 
 
 def setting_errors(points: Sequence[SeriesPoint], *, source_detector_mm: float | None) -> dict[str, Any] | None:
-    """What is known of both errors, from flats of the same kV and filter that differ in exposure or distance.
+    """What is known of the three, from flats of the same kV and filter that differ in exposure, distance or signal.
 
     Args:
         points: flats in use.
         source_detector_mm: where a flat states no distance of its own.
 
     Returns:
-        exposure_ms, distance_mm: value and sd of each; second_moments: of both (2, 2), about 0. None: no flat has a load.
+        exposure_ms, distance_mm, bend: value and sd of each; second_moments: of all (3, 3), about 0; largest_DN: of the brightest
+        flat. None: no flat has a load.
     """
     known = [point for point in points if point.load_mAs and point.exposure_ms and point.signal_DN > 0]
     if not known:
@@ -41,26 +45,39 @@ def setting_errors(points: Sequence[SeriesPoint], *, source_detector_mm: float |
     level = np.array([math.log(point.signal_DN / float(point.load_mAs or 1.0)) for point in known]) + 2.0 * np.log(
         distances
     )
-    change = np.stack([rate_changes(point.exposure_ms, mm) for point, mm in zip(known, distances, strict=True)])
+    largest_DN = max(point.signal_DN for point in known)
+    change = np.stack(
+        [
+            rate_changes(exposure_ms=point.exposure_ms, source_detector_mm=mm, share=point.signal_DN / largest_DN)
+            for point, mm in zip(known, distances, strict=True)
+        ]
+    )
     beams = [(point.kV, tuple(sorted(map(str, point.filters)))) for point in known]
     for beam in set(beams):  # the level of a beam is free
         members = np.array([one == beam for one in beams])
         level[members] -= level[members].mean()
         change[members] -= change[members].mean(axis=0)
     degrees = len(known) - len(set(beams))
-    precision = np.diag([EXPOSURE_SD_MS**-2.0, (DISTANCE_SD * float(np.mean(distances))) ** -2.0])
-    variance = USUAL_STRAY**2
-    found: NDArray[np.float64] = np.zeros(2)
-    covariance: NDArray[np.float64] = np.linalg.inv(precision)
-    for _ in range(2):  # levels that stray by more than lines do usually tell as much less
-        covariance = np.asarray(np.linalg.inv(change.T @ change / variance + precision))
+    least = np.array([EXPOSURE_SD_MS, DISTANCE_SD * float(np.mean(distances)), BEND_SD]) ** 2
+    prior, variance = least, USUAL_STRAY**2
+    found: NDArray[np.float64] = np.zeros(3)
+    covariance: NDArray[np.float64] = np.diag(least)
+    for _ in range(_ROUNDS):
+        covariance = np.asarray(np.linalg.inv(change.T @ change / variance + np.diag(1.0 / prior)))
         found = np.asarray(covariance @ change.T @ level / variance)
-        if degrees > 0:
-            variance = max(variance, float(np.sum((level - change @ found) ** 2)) / degrees)
+        # a line that is far off is one of few that are: its own size stands in for what lines are off usually
+        own = np.diag(covariance)
+        told = float(np.sum(1.0 - own / prior))
+        prior = np.maximum(least, found**2 + own)
+        if degrees - told > 0.5:  # levels that stray by more than lines do usually tell as much less
+            left = float(np.sum((level - change @ found) ** 2))
+            variance = max(USUAL_STRAY**2, left / (degrees - told))
     sd = np.sqrt(np.diag(covariance))
     return {
         "exposure_ms": {"value": float(found[0]), "sd": float(sd[0])},
         "distance_mm": {"value": float(found[1]), "sd": float(sd[1])},
+        "bend": {"value": float(found[2]), "sd": float(sd[2])},
+        "largest_DN": largest_DN,
         "second_moments": (covariance + np.outer(found, found)).tolist(),
     }
 
@@ -87,11 +104,21 @@ def allowing_for_settings(
         return tuple(levels)
     point_of = {point.series: point for point in points}
     changes = [
-        np.mean([rate_changes(point_of[name].exposure_ms, level.source_detector_mm) for name in level.series], axis=0)
+        np.mean(
+            [
+                rate_changes(
+                    exposure_ms=point_of[name].exposure_ms,
+                    source_detector_mm=level.source_detector_mm,
+                    share=point_of[name].signal_DN / errors["largest_DN"],
+                )
+                for name in level.series
+            ],
+            axis=0,
+        )
         for level in levels
     ]
     lit = [change for level, change in zip(levels, changes, strict=True) if level.rate_DN_per_mAs is not None]
-    middle = np.mean(lit, axis=0) if lit else np.zeros(2)
+    middle = np.mean(lit, axis=0) if lit else np.zeros(3)
     result = []
     for level, change in zip(levels, changes, strict=True):
         rate = level.rate_DN_per_mAs

@@ -11,6 +11,7 @@ from raytwin.acquisition.setting import Setting, filters_from_text
 from raytwin.calibration.calibrate import calibrate_twin
 from raytwin.calibration.flat_levels import SeriesPoint
 from raytwin.calibration.setting_errors import (
+    BEND_SD,
     DISTANCE_SD,
     EXPOSURE_SD_MS,
     allowing_for_settings,
@@ -43,6 +44,7 @@ def test_flats_of_one_exposure_and_distance_leave_what_is_known_beforehand():
     found = setting_errors([flat(0), flat(1, kV=40.0)], source_detector_mm=MM)
     assert found["exposure_ms"] == {"value": 0.0, "sd": pytest.approx(EXPOSURE_SD_MS)}
     assert found["distance_mm"] == {"value": 0.0, "sd": pytest.approx(DISTANCE_SD * MM)}
+    assert found["bend"] == {"value": 0.0, "sd": pytest.approx(BEND_SD)}
     # beams have levels of their own: another voltage at another exposure tells nothing
     assert setting_errors([flat(0), flat(1, kV=40.0, ms=20.0)], source_detector_mm=MM)["exposure_ms"]["value"] == 0.0
     assert setting_errors([dataclasses.replace(flat(0), load_mAs=None)], source_detector_mm=MM) is None
@@ -52,17 +54,24 @@ def test_flats_of_one_exposure_and_distance_leave_what_is_known_beforehand():
 def test_two_exposures_tell_how_long_they_are(late_ms):
     points = [flat(0, late_ms=late_ms), flat(1, ms=20.0, late_ms=late_ms), flat(2, kV=40.0)]
     found = setting_errors(points, source_detector_mm=MM)["exposure_ms"]
-    assert found["sd"] < 0.1
-    assert found["value"] == pytest.approx(late_ms, abs=0.1 + 0.2 * late_ms)
+    assert found["sd"] < 0.25
+    assert found["value"] == pytest.approx(late_ms, abs=0.1 + 0.3 * late_ms)
     told = told_errors(setting_errors(points, source_detector_mm=MM))
     assert len(told) == int(late_ms > 0.0) and all("longer than stated" in line for line in told)
+
+
+def test_two_currents_tell_how_the_response_bends():
+    """A level 4 % low at the brightest flat: what lies above is as uncertain as its law, its noise four times."""
+    bright, dim = flat(0), dataclasses.replace(flat(1), load_mAs=0.02, signal_DN=20.0 * 20.0 * 1.04)
+    found = setting_errors([bright, dim], source_detector_mm=MM)["bend"]
+    assert -0.05 < found["value"] < -0.025 and found["sd"] < BEND_SD
 
 
 def test_two_distances_tell_where_the_focal_spot_is():
     points = [flat(0, near_mm=4.0), flat(1, mm=530.0, near_mm=4.0)]
     found = setting_errors(points, source_detector_mm=MM)["distance_mm"]
-    assert found["value"] == pytest.approx(-4.0, abs=0.5)
-    assert found["sd"] < 2.0
+    assert found["value"] == pytest.approx(-4.0, abs=1.0)
+    assert found["sd"] < 3.0
 
 
 def test_beams_that_were_measured_at_other_exposures_are_less_sure_against_each_other(make_model_twin):
@@ -75,7 +84,8 @@ def test_beams_that_were_measured_at_other_exposures_are_less_sure_against_each_
         points = [flat(0, kV=40.0), flat(1, kV=90.0, ms=ms)]
         errors = setting_errors(points, source_detector_mm=MM)
         for before, after in zip(levels, allowing_for_settings(levels, points, errors), strict=True):
-            added = math.hypot(Z95 * expected, half_width(before.rate_DN_per_mAs))
+            of_bend = BEND_SD * (1.0 - ms / 100.0) / 2
+            added = math.hypot(Z95 * expected, Z95 * of_bend, half_width(before.rate_DN_per_mAs))
             assert half_width(after.rate_DN_per_mAs) == pytest.approx(added, rel=1e-6)
     assert allowing_for_settings(levels, points, None) == tuple(levels)
 
@@ -110,13 +120,13 @@ def test_predictions_hold_exposures_that_are_longer_than_stated(tmp_path, make_m
         assert half_width(short) > half_width(there)
         if len(measured_ms) == 1:
             expected = Z95 * EXPOSURE_SD_MS * (1 / 20 - 1 / 100)
-            assert half_width(short) == pytest.approx(math.hypot(half_width(there), expected), rel=0.1)
+            assert half_width(short) == pytest.approx(math.hypot(half_width(there), expected), rel=0.15)
 
 
 def test_evidence_of_older_twins_says_nothing_and_damaged_evidence_is_refused(make_model_twin):
     twin, setting = make_model_twin((8, 8)), Setting(kV=60.0, current_mA=1.0, exposure_ms=20.0)
-    assert stray_of_setting(twin, setting, None, distance_mm=MM) == 0.0
+    assert stray_of_setting(twin, setting, None, distance_mm=MM, signal_DN=1.0) == (0.0, 0.0)
     row = {"series": "a", "used": True, "signal_DN": 100.0, "load_mAs": 0.1, "exposure_ms": 100.0}
-    damaged = {"photon_transfer": [row], "setting_errors": {"second_moments": [[1.0, "b"], [0.0, 1.0]]}}
+    damaged = {"photon_transfer": [row], "setting_errors": {"second_moments": [[1.0, "b"]], "largest_DN": 1.0}}
     with pytest.raises(InputError, match="setting_errors"):
-        stray_of_setting(dataclasses.replace(twin, evidence=damaged), setting, None, distance_mm=MM)
+        stray_of_setting(dataclasses.replace(twin, evidence=damaged), setting, None, distance_mm=MM, signal_DN=1.0)

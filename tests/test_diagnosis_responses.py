@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.api._given import as_twin
 from raytwin.calibration.priors import PRIORS
+from raytwin.calibration.setting_errors import EXPOSURE_SD_MS
 from raytwin.diagnosis.model import changes as scales
 from raytwin.diagnosis.model.calibrated_maps import calibrated_maps
 from raytwin.diagnosis.model.changes import Change, catalogue_variants, departures_found, twin_changes
@@ -399,8 +400,8 @@ def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
         return nuisances_of_series(session, probes, signal, Redrawn(thicker={"Al": (thinner, {})}, covered=None))
 
     usual, wider = columns(1.0), columns(3.0)
-    # all exposures 20 us longer or shorter than stated
-    np.testing.assert_allclose(usual["length of exposures"], 0.02 / 20.0 * signal.ravel())
+    # all exposures longer or shorter than stated
+    np.testing.assert_allclose(usual["length of exposures"], EXPOSURE_SD_MS / 20.0 * signal.ravel())
     name = "hardness at 80 kV behind Al"
     assert name not in usual
     of_beam = 3.0 * scales.ATTENUATION_OF_BEAM_SD / scales.THICKNESS_SD

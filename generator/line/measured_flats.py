@@ -59,45 +59,66 @@ def stray_of_noise(twin: Twin) -> float:
     return _scatter(twin, "scatter_of_noise")
 
 
-def rate_changes(exposure_ms: float | None, source_detector_mm: float | None) -> NDArray[np.float64]:
-    """What 1 ms and 1 mm more than stated do to the logarithm of a level over its load (2,); 0 where unknown."""
+def rate_changes(*, exposure_ms: float | None, source_detector_mm: float | None, share: float) -> NDArray[np.float64]:
+    """What 1 ms and 1 mm more than stated, and a bend of 1 at the brightest flat, do to the logarithm of a level over its load (3,).
+
+    0 where unknown; share: the level over that of the brightest flat.
+    """
     return np.array(
-        [1.0 / exposure_ms if exposure_ms else 0.0, -2.0 / source_detector_mm if source_detector_mm else 0.0]
+        [1.0 / exposure_ms if exposure_ms else 0.0, -2.0 / source_detector_mm if source_detector_mm else 0.0, share]
     )
 
 
 def stray_of_rates(errors: Mapping[str, Any], change: NDArray[np.float64]) -> float:
-    """Relative standard deviation of a level over its load at one setting against another, from what times and distances are off.
+    """Relative standard deviation of a level over its load at one setting against another, as times, distances and response leave it.
 
     errors: `setting_errors` of the evidence; change: `rate_changes` at the one less those at the other.
     """
     return math.sqrt(max(float(change @ np.asarray(errors["second_moments"], dtype=np.float64) @ change), 0.0))
 
 
-def stray_of_setting(twin: Twin, setting: Setting, level: Level | None, *, distance_mm: float) -> float:
-    """Relative standard deviation of a level at a setting, as its exposure and distance are not those of the calibrating flats.
+def stray_of_setting(
+    twin: Twin, setting: Setting, level: Level | None, *, distance_mm: float, signal_DN: float
+) -> tuple[float, float]:
+    """Relative standard deviations at a setting, of the level and of the variance of its quanta, as exposure, distance and level are
+    not those of the calibrating flats.
+
+    A response S (1 + b S) has the slope 1 + 2 b S, and the quanta's variance goes with its square: four times as far as the level.
 
     Args:
-        twin: whose evidence says how far times and distances may be off; an older one's says nothing, which counts as 0.
+        twin: whose evidence says how far times, distances and response may be off; an older one's says nothing, which counts as 0.
         setting: of the level.
         level: the measured level of its beam, whose flats are compared with; None: all flats of the twin.
         distance_mm: from the source to the detector at the setting.
+        signal_DN: the level itself.
 
     Raises:
         InputError: evidence that cannot be read.
     """
     errors = twin.evidence.get("setting_errors")
     if errors is None:
-        return 0.0
+        return 0.0, 0.0
     flats = [flat for flat in measured_flats(twin) if flat.load_mAs and (level is None or flat.series in level.series)]
     usual_mm = twin.instrument.source_detector_mm or distance_mm
-    known = [rate_changes(flat.exposure_ms, flat.source_detector_mm or usual_mm) for flat in flats]
-    if not known:
-        return 0.0
+    if not flats:
+        return 0.0, 0.0
     try:
-        return stray_of_rates(errors, rate_changes(setting.exposure_ms, distance_mm) - np.mean(known, axis=0))
-    except (TypeError, KeyError, ValueError):
-        raise _unreadable("setting_errors", "`second_moments` of 2 x 2 numbers") from None
+        largest_DN = float(errors["largest_DN"])
+        known = [
+            rate_changes(
+                exposure_ms=flat.exposure_ms,
+                source_detector_mm=flat.source_detector_mm or usual_mm,
+                share=flat.signal_DN / largest_DN,
+            )
+            for flat in flats
+        ]
+        there = rate_changes(
+            exposure_ms=setting.exposure_ms, source_detector_mm=distance_mm, share=signal_DN / largest_DN
+        )
+        change = there - np.mean(known, axis=0)
+        return stray_of_rates(errors, change), stray_of_rates(errors, change * (1.0, 1.0, 4.0))
+    except (TypeError, KeyError, ValueError, ZeroDivisionError):
+        raise _unreadable("setting_errors", "`second_moments` of 3 x 3 numbers and `largest_DN`") from None
 
 
 def _unreadable(name: str, expected: str) -> InputError:

@@ -413,7 +413,9 @@ def _by_model(
     # the draws hold what the parameters leave open; single levels stray from any such model, more so outside
     widen = math.sqrt(1.0 + len(outside))
     beyond_repeats = math.sqrt(max(stray_of_flats(twin) ** 2 - USUAL_STRAY**2, 0.0))
-    of_setting = stray_of_setting(twin, setting, None, distance_mm=distance_mm)
+    of_setting, of_noise = stray_of_setting(
+        twin, setting, None, distance_mm=distance_mm, signal_DN=float(np.median(rate_draws))
+    )
     level_sd = math.hypot(widen * posterior.level_discrepancy, beyond_repeats, of_setting)
     gain_sd = widen * posterior.gain_discrepancy
     share, restored_sd = slope_share(twin), _restored_sd(twin)
@@ -428,7 +430,7 @@ def _by_model(
         mean_DN=_estimate_from_draws(rate_draws, level_sd),
         gain_DN=_estimate_from_draws(signal.gain_DN, math.hypot(gain_sd, restored_sd, own_gain_sd)),
         quantum_DN2=signal.gain_DN * (share if own_share is None else own_share) * rate_draws,
-        quantum_sd=math.hypot(level_sd, gain_sd),
+        quantum_sd=math.hypot(level_sd, gain_sd, _beyond(of_noise, of_setting)),
         # photons are counted by the gain: what it is known less by, they are as well
         photons=_estimate_from_draws(signal.absorbed_per_mAs * load_mAs * factor, math.hypot(level_sd, restored_sd)),
         kerma_uGy=_estimate_from_draws(
@@ -441,15 +443,22 @@ def _by_model(
     )
 
 
+def _beyond(of_noise: float, of_level: float) -> float:
+    """Standard deviation that the noise has beside that of the level."""
+    return math.sqrt(max(of_noise**2 - of_level**2, 0.0))
+
+
 def _as_measured(
     twin: Twin, setting: Setting, level: Level, modelled: _Flat | None, *, load_mAs: float, distance_mm: float
 ) -> _Flat | None:
     """The flatfield with what was measured at this kV and filter in place of the model's; None: its load is not known."""
+    more_noise = 0.0
     if level.rate_DN_per_mAs is not None:
         rate = level.rate_DN_per_mAs
-        of_setting = stray_of_setting(twin, setting, level, distance_mm=distance_mm)
-        relative = math.hypot(rate.sd / rate.value, stray_of_flats(twin), of_setting)
         value = rate.value * load_mAs * ((level.source_detector_mm or distance_mm) / distance_mm) ** 2
+        of_setting, of_noise = stray_of_setting(twin, setting, level, distance_mm=distance_mm, signal_DN=value)
+        relative = math.hypot(rate.sd / rate.value, stray_of_flats(twin), of_setting)
+        more_noise = _beyond(of_noise, of_setting)
         mean_DN, gain_DN = estimate_from_sd(value, relative * value), level.gain_DN
         outside = _outside(twin, setting, mean_DN.value)
     elif modelled is not None:
@@ -461,7 +470,7 @@ def _as_measured(
         mean_DN=mean_DN,
         gain_DN=gain_DN,
         quantum_DN2=np.array([slope.value * mean_DN.value]),
-        quantum_sd=math.hypot(_log_sd(slope), _log_sd(mean_DN)),
+        quantum_sd=math.hypot(_log_sd(slope), _log_sd(mean_DN), more_noise),
         photons=None if modelled is None else modelled.photons,
         kerma_uGy=None if modelled is None else modelled.kerma_uGy,
         outside=outside,

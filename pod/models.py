@@ -143,6 +143,11 @@ def with_links_open(
         told += (
             "bounds of all curves that fit stand in over_links" if named else "bounds are those of all curves that fit"
         )
+        endless = [one.name for one in found if one.name in joined.curves and one.a90_95 is None]
+        if endless and not named:
+            told += (
+                f"; there are none, as {', '.join(endless)} may be right and {'have' if endless[1:] else 'has'} none"
+            )
     return fit if named else _widened(fit, joined, best), joined, told
 
 

@@ -300,7 +300,8 @@ class _Page:
         try:
             self.state = self._state_of_controls()
         except InputError as error:
-            self._send({"limits": {"text": _problem_text(str(error)), "visible": True}}, began)
+            told = f"{error}. All numbers on the page are still those of the settings before."
+            self._send({"limits": {"text": _problem_text(told), "visible": True}}, began)
             return
         view = self.explorer.view(self.state)
         changes: Changes = {

@@ -84,9 +84,11 @@ def setting_errors(points: Sequence[SeriesPoint], *, source_detector_mm: float |
 
 def told_errors(errors: Mapping[str, Any] | None) -> list[str]:
     """A line for each error that is three standard deviations from 0."""
+    if errors is None:
+        return []
     told = []
     for name, what, unit in (("exposure_ms", "exposures", "ms"), ("distance_mm", "source-detector distances", "mm")):
-        found = errors[name] if errors is not None else {"value": 0.0, "sd": 1.0}
+        found = errors[name]
         if abs(found["value"]) > _CLEAR * found["sd"]:
             away = f"{abs(found['value']):.2g} {unit} {'longer' if found['value'] > 0 else 'shorter'} than stated"
             told.append(

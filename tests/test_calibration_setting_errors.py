@@ -60,11 +60,18 @@ def test_two_exposures_tell_how_long_they_are(late_ms):
     assert len(told) == int(late_ms > 0.0) and all("longer than stated" in line for line in told)
 
 
-def test_two_currents_tell_how_the_response_bends():
+def test_two_currents_tell_how_the_response_bends(make_model_twin):
     """A level 4 % low at the brightest flat: what lies above is as uncertain as its law, its noise four times."""
     bright, dim = flat(0), dataclasses.replace(flat(1), load_mAs=0.02, signal_DN=20.0 * 20.0 * 1.04)
     found = setting_errors([bright, dim], source_detector_mm=MM)["bend"]
     assert -0.05 < found["value"] < -0.025 and found["sd"] < BEND_SD
+    rows = [one.as_dict() for one in (bright, dim)]
+    evidence = {"photon_transfer": rows, "setting_errors": setting_errors([bright, dim], source_detector_mm=MM)}
+    twin = dataclasses.replace(make_model_twin((8, 8)), evidence=evidence)
+    setting = Setting(kV=80.0, current_mA=2.0, exposure_ms=100.0, filters=COPPER)
+    of_level, of_noise = stray_of_setting(twin, setting, None, distance_mm=MM, signal_DN=4000.0)
+    assert of_noise == pytest.approx(4.0 * of_level)
+    assert of_level == pytest.approx(math.hypot(found["value"], found["sd"]) * (2.0 - np.mean([1.0, 0.208])))
 
 
 def test_two_distances_tell_where_the_focal_spot_is():

@@ -34,6 +34,31 @@ def powers(spread, *, seed=0, count=8, interference_DN=0.0, white=WHITE):
     return found
 
 
+def test_slopes_are_those_of_each_beam_where_beams_spread_otherwise():
+    """Light of a soft beam is made elsewhere in a screen than that of a hard one: one spread fits neither."""
+    rng = np.random.default_rng(4)
+    plan = [(signal, gain, group) for group, gain in enumerate((6.0, 8.0, 11.0, 14.0)) for signal in (1000.0, 3000.0)]
+    spreads = [Spread(sigma_px=sigma_px) for sigma_px in (0.38, 0.42, 0.46, 0.50)]
+    found, direct = [], {}
+    for signal, gain, group in plan:
+        level = np.full(SHAPE, signal)
+        noise = {"gain_DN": gain, "white_fraction": 0.0, "read_variance_DN2": 9.0, "spread": spreads[group], "rng": rng}
+        frames = np.stack([level + sample_frame_noise(level, **noise) for _ in range(12)])
+        found.append(compute_noise_power([frames], signal_DN=level, good=GOOD))
+    dark = np.stack([3.0 * rng.standard_normal(SHAPE) for _ in range(12)])
+    found.append(compute_noise_power([dark], signal_DN=np.zeros(SHAPE), good=GOOD))
+    fit = fit_spread(found, group=[*(group for *_, group in plan), -1])
+    for group, gain in enumerate((6.0, 8.0, 11.0, 14.0)):
+        slope = gain * spreads[group].variance_share
+        direct[group] = abs(fit.slope_DN[group] / slope - 1.0)
+        assert abs(fit.slope_DN[group] - slope) < 3.0 * fit.slope_sd_DN[group]
+        assert abs(fit.gain_DN[group] - gain) < 3.0 * fit.gain_sd_DN[group]
+    # the spread that all share would leave slopes 10 % off at either end
+    common = fit.spread.variance_share
+    assert abs(common / spreads[0].variance_share - 1.0) > 0.08
+    assert max(direct.values()) < 0.02
+
+
 SPREADS = {
     "narrow": Spread(sigma_px=0.4),
     "counted in pixels": Spread(model="sampled", sigma_px=0.8),

@@ -19,6 +19,7 @@ _WARMER = 0.25  # of a dark current: two degrees where it doubles every six
 _RELEASED = 0.08  # of the exposures before, which an image lag may leave in a dark
 _WEAK = 0.1  # of the flats' usual level, below which a flat's pattern says nothing of a shadow
 _ALIKE = 0.1  # of the noise of flats of one beam: its gains, and their sampling errors
+_CLEAR = 3.0  # standard deviations
 _SHADOW_IN_FLAT = 0.35  # spread of the logarithm of a flat against other flats
 
 
@@ -75,7 +76,7 @@ def _dark_current(exposure_ms: float, level_DN: float, others: Sequence[tuple[fl
     return typical[first] + rate * (exposure_ms - first)
 
 
-def flats_without_beam(judged: list[Reading], good: NDArray[np.bool_]) -> tuple[list[Finding], list[Reading]]:
+def flats_without_beam(judged: Sequence[Reading]) -> tuple[list[Finding], list[Reading]]:
     """Flats without light among flats with light, and the other series."""
     flats = [item for item in judged if item.series.kind == "flat"]
     found, left = [], []
@@ -89,7 +90,7 @@ def flats_without_beam(judged: list[Reading], good: NDArray[np.bool_]) -> tuple[
     gains = [item.gain_DN for item in flats if item.name not in dim and item.gain_DN > 0]
     usual = float(np.median(gains)) if gains else math.nan
     for item in judged:
-        dark = item.name in dim and not _shows_quanta(item, usual, good)
+        dark = item.name in dim and not _shows_quanta(item, usual)
         if item.series.kind == "flat" and (dark or not item.level_DN > 0):
             found.append(Finding(code=FindingCode.NO_LIGHT, series=item.name, values={"signal": item.level_DN}))
         else:
@@ -97,12 +98,9 @@ def flats_without_beam(judged: list[Reading], good: NDArray[np.bool_]) -> tuple[
     return found, left
 
 
-def _shows_quanta(item: Reading, gain_DN: float, good: NDArray[np.bool_]) -> bool:
+def _shows_quanta(item: Reading, gain_DN: float) -> bool:
     """Whether the little light of a flat has the noise of quanta, which are worth about gain_DN each: a soft beam behind metal."""
-    if item.variance_DN2 is None or not item.gain_DN > 0:
-        return False
-    clear = item.gain_DN * item.level_DN > _CLEAR_QUANTA * item.gain_sd * mean_of(item.variance_DN2, good)
-    return clear and gain_DN / _ENERGY_RANGE < item.gain_DN < gain_DN * _ENERGY_RANGE
+    return item.gain_sd < 1.0 / _CLEAR_QUANTA and gain_DN / _ENERGY_RANGE < item.gain_DN < gain_DN * _ENERGY_RANGE
 
 
 def shadows_in_flats(judged: Sequence[Reading], read_DN2: float, good: NDArray[np.bool_]) -> list[Finding]:
@@ -161,12 +159,14 @@ def undeclared_means(judged: Sequence[Reading], read_DN2: float, good: NDArray[n
 
 
 def _as_mean(
-    item: Reading, alike: Sequence[Reading], read_DN2: float, good: NDArray[np.bool_]
+    item: Reading, members: Sequence[Reading], read_DN2: float, good: NDArray[np.bool_]
 ) -> tuple[float, str, dict[str, float | str]]:
     """How much clearer a flat is a mean of two frames than a single exposure (1: neither), its name, and what is said of it."""
-    others = [one for one in alike if one is not item]
+    others = [one for one in members if one is not item]
     variances = np.array([mean_of(one.variance_DN2, good) for one in others]) - read_DN2
-    expected = _expected_variance(item.level_DN, np.array([one.level_DN for one in others]), variances)
+    # what is known of a dim flat's quanta hangs on the read noise
+    alike = np.array([_ALIKE + _CLEAR * min(one.gain_sd, 1.0) for one in others])
+    expected = _expected_variance(item.level_DN, np.array([one.level_DN for one in others]), variances, alike)
     if expected is None or expected[0] <= read_DN2:
         return 0.0, item.name, {}
     single, likely = (read_DN2 + one for one in expected)
@@ -180,9 +180,11 @@ def _as_mean(
 
 
 def _expected_variance(
-    level_DN: float, levels_DN: NDArray[np.float64], variances_DN2: NDArray[np.float64]
+    level_DN: float, levels_DN: NDArray[np.float64], variances_DN2: NDArray[np.float64], alike: NDArray[np.float64]
 ) -> tuple[float, float] | None:
     """The least and the likeliest variance at a level, DN^2, of noise as other flats (flat,) show it; None: they show no such noise.
+
+    alike (flat,): to which share of itself each variance is known.
 
     Noise has a constant part (electronics, rounding), one that grows as the level (quanta), and one as its square (flicker).
     """
@@ -191,12 +193,12 @@ def _expected_variance(
     if not levels_DN.size or not np.all(variances_DN2 > 0):
         return None
     parts = np.stack([np.ones(levels_DN.size), levels_DN / level_DN, (levels_DN / level_DN) ** 2], axis=1)
-    limits = np.concatenate([(1.0 + _ALIKE) * variances_DN2, -(1.0 - _ALIKE) * variances_DN2])
+    limits = np.concatenate([(1.0 + alike) * variances_DN2, -(1.0 - alike) * variances_DN2])
     least = linprog(np.ones(3), A_ub=np.concatenate([parts, -parts]), b_ub=limits, bounds=(0.0, None))
     if not least.success:
         return None
     quanta = variances_DN2 * level_DN / levels_DN
     likely = float(np.median(quanta))
-    if np.any(np.abs(quanta / likely - 1.0) > _ALIKE):  # they alone do not explain it
+    if np.any(np.abs(quanta / likely - 1.0) > alike):  # they alone do not explain it
         likely = float(nnls(parts / variances_DN2[:, None], np.ones(levels_DN.size))[0].sum())
     return float(least.fun), max(likely, float(least.fun))

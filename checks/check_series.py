@@ -1,7 +1,7 @@
 """What the series of an acquisition show by themselves, against each other and against their labels."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from .declared import unknown_words
 from .findings import Finding, FindingCode, Severity
 from .labels import check_labels
 from .loads_and_clocks import clock_findings, load_findings
+from .readings import DARK_SD_DN
 from .series_scan import SeriesScan, scan_series
 
 _AS_BRIGHT = 0.9  # of the highest value, median of the neighbours of a pixel that light has saturated; assumed
@@ -392,7 +393,8 @@ def _session_findings(
         and not scans[item.name].codes & UNFIT
     ]
     signals = _signals([item for item in read if item.name not in unfit], flats, levels, dark_DN)
-    found += load_findings([item for item in flats if item.name not in nameless], signals)
+    stated = [item for item in flats if item.name not in nameless]
+    found += load_findings(stated, signals, dark_sd_DN=_dark_sd_DN(read, levels))
     found += clock_findings(read)
     found += [
         Finding(code=FindingCode.SINGLE_FRAME, series=item.name)
@@ -422,6 +424,17 @@ def _label_findings(acquisition: AcquisitionFile, readable: Sequence[Series]) ->
             continue  # maps that cannot be read, or no detector numbers: told where they belong
         found += [*checked.findings, *checked.stops]
     return found
+
+
+def _dark_sd_DN(series: Sequence[Series], levels: Mapping[str, float]) -> float:
+    """Standard deviation of a dark's level, by what darks of one exposure differ and by what those of a line without fault may."""
+    alike: dict[float | None, list[float]] = {}
+    for item in series:
+        if item.kind == "dark":
+            alike.setdefault(item.exposure_ms, []).append(levels[item.name])
+    squares = [(level - sum(group) / len(group)) ** 2 for group in alike.values() for level in group]
+    freedom = len(squares) - len(alike)
+    return math.hypot(DARK_SD_DN, math.sqrt(sum(squares) / freedom) if freedom else 0.0)
 
 
 def _signals(

@@ -19,9 +19,11 @@ from .findings import Finding, FindingCode
 from .label_model import LabelModel, spectral_model_of
 from .map_checks import wrong_maps
 from .readings import (
+    DARK_SD_DN,
     FRAMES_READ,
+    READ_NOISE_SD,
+    Dark,
     Explained,
-    FloatArray,
     Reading,
     good_pixels,
     is_top,
@@ -87,7 +89,7 @@ def check_labels(
     good = good_pixels(readings)
     shone_on = lit_darks(darks, lit, good, bits=acquisition.instrument.bits)
     known = _Darks(readings=_less(darks, shone_on), twins_DN=dark_DN, good=good, stride=stride)
-    dim, judged = flats_without_beam(_measured(lit, known), good)
+    dim, judged = flats_without_beam(_measured(lit, known))
     _flatten(judged, good)
     shadowed = shadows_in_flats(judged, known.noise_DN2, good)
     judged = _less(judged, shadowed)
@@ -189,25 +191,43 @@ class _Darks:
         images = [item.variance_DN2 for item in self.readings if item.variance_DN2 is not None]
         return min((mean_of(image, self.good) for image in images), default=0.0)
 
-    def of(self, item: Series) -> FloatArray | None:
-        """Dark frame (row, column) nearest to a series' exposure time, DN; None: nothing is known."""
+    def of(self, item: Series) -> Dark | None:
+        """Dark of a series: the median of those nearest to its exposure time; None: nothing is known.
+
+        They may be off by how far they differ, and by what darks of a line without fault differ.
+        """
+        nearest = self._nearest(item)
+        known = [one.variance_DN2 for one in nearest if one.variance_DN2 is not None]
+        variances_DN2 = [mean_of(image, self.good) for image in known] or [0.0]
+        variance_DN2 = float(np.median(variances_DN2))
+        levels_DN = [mean_of(one.mean_DN, self.good) for one in nearest] or [0.0]
         if "offset" in item.corrected:
-            return np.zeros(self.good.shape)
-        if self.readings:
-            off = [abs((dark.series.exposure_ms or 0.0) - (item.exposure_ms or 0.0)) for dark in self.readings]
-            nearest = min(off) * 1.001 + 1e-9
-            same = [dark.mean_DN for dark, far in zip(self.readings, off, strict=True) if far <= nearest]
-            return np.asarray(np.median(np.stack(same), axis=0), dtype=np.float64)
-        if self.twins_DN is not None:
-            found = np.asarray(self.twins_DN(item.exposure_ms), dtype=np.float64)[:: self.stride, :: self.stride]
-            return found if found.shape == self.good.shape else None
-        return None
+            mean_DN = np.zeros(self.good.shape)
+        elif nearest:
+            mean_DN = np.median(np.stack([one.mean_DN for one in nearest]), axis=0)
+        elif self.twins_DN is not None:
+            mean_DN = np.asarray(self.twins_DN(item.exposure_ms), dtype=np.float64)[:: self.stride, :: self.stride]
+            if mean_DN.shape != self.good.shape:
+                return None
+        else:
+            return None
+        return Dark(
+            mean_DN=mean_DN,
+            mean_sd_DN=math.hypot(DARK_SD_DN, float(np.std(levels_DN))),
+            variance_DN2=variance_DN2,
+            variance_sd_DN2=math.hypot(READ_NOISE_SD * variance_DN2, float(np.std(variances_DN2))),
+        )
+
+    def _nearest(self, item: Series) -> list[Reading]:
+        """Dark series whose exposure time is nearest to that of a series."""
+        off = [abs((dark.series.exposure_ms or 0.0) - (item.exposure_ms or 0.0)) for dark in self.readings]
+        nearest = min(off, default=0.0) * 1.001 + 1e-9
+        return [dark for dark, far in zip(self.readings, off, strict=True) if far <= nearest]
 
 
 def _measured(lit: Sequence[Reading], darks: _Darks) -> list[Reading]:
     """Lit series that a dark can be taken off, with level, noise and picture, and what lag may have released in them."""
-    noise_DN2 = darks.noise_DN2
-    judged = [item for item in lit if measure(item, darks.of(item.series), noise_DN2, darks.good)]
+    judged = [item for item in lit if measure(item, darks.of(item.series), darks.good)]
     for reading in judged:
         before = [one.level_DN for one in judged if one.series.index < reading.series.index][-_REMEMBERED:]
         reading.released = _RELEASED_LATER * max(before, default=0.0) / max(reading.level_DN, 1e-9)

@@ -13,6 +13,7 @@ from .findings import Finding, FindingCode
 # Departures of a level from its label that are no wrong label: 3 sd of the largest plausible output drift (3 % rms), and
 # a detector whose response bends by up to 5 %.
 LEVEL_FITS = 0.15
+_CLEAR = 3.0  # standard deviations of the dark
 _GAP = 2.5  # usual intervals: at least one frame and a half is missing
 
 Levels = Mapping[str, float]
@@ -42,12 +43,13 @@ def _layers(item: Series) -> tuple[str, ...]:
     return tuple(sorted(str(layer) for layer in item.filters))
 
 
-def load_findings(series: Sequence[Series], signals_DN: Levels) -> list[Finding]:
+def load_findings(series: Sequence[Series], signals_DN: Levels, *, dark_sd_DN: float) -> list[Finding]:
     """Flats whose signal departs from the line through the other flats of their beam.
 
     Args:
         series: flats that are neither saturated nor without light.
         signals_DN: level above dark, by name.
+        dark_sd_DN: by how much any of them may be off, as darks differ.
     """
     groups: dict[tuple[Any, ...], list[tuple[Series, float, str, str, float]]] = {}
     for item in series:
@@ -57,6 +59,8 @@ def load_findings(series: Sequence[Series], signals_DN: Levels) -> list[Finding]
     found = []
     for members in groups.values():
         rates = np.array([signals_DN[item.name] / load for item, load, *_ in members])
+        # logarithmic, from the line through the others
+        fits = np.array([math.log1p(LEVEL_FITS + _CLEAR * dark_sd_DN / signals_DN[item.name]) for item, *_ in members])
         if len({round(load, 12) for _, load, *_ in members}) < 2 and len(members) < 3:
             continue
         for index, (item, _, quantity, unit, declared) in enumerate(members):
@@ -64,9 +68,10 @@ def load_findings(series: Sequence[Series], signals_DN: Levels) -> list[Finding]
             typical = float(np.median(others)) if others.size else rates[index]
             off = float(rates[index] / typical - 1.0)
             # of two that disagree nobody knows which is wrong: the later one is named
-            agree = others.size >= 2 and float(np.max(np.abs(others / typical - 1.0))) <= LEVEL_FITS
+            among = np.abs(np.log(others / typical)) <= np.delete(fits, index)
+            agree = others.size >= 2 and bool(np.all(among))
             last_of_two = others.size == 1 and index == 1
-            if abs(math.log(rates[index] / typical)) > math.log1p(LEVEL_FITS) and (agree or last_of_two):
+            if abs(math.log(rates[index] / typical)) > fits[index] and (agree or last_of_two):
                 found.append(
                     Finding(
                         code=FindingCode.LOAD_LABEL,

@@ -13,6 +13,8 @@ from ..calibration.frame_checks import repeats_the_last
 from ..errors import InputError
 
 FloatArray = NDArray[np.float64]
+# what darks, and the variance of their frames, differ by from series to series of a line without fault
+DARK_SD_DN, READ_NOISE_SD = 0.25, 0.01
 FRAMES_READ = 8  # read of each series
 _FRAMES_OF_NOISE = 5  # that an object's series needs to say something of noise
 _LEAST_BRIGHTEST_DN = 30.0  # of frames that are no whole numbers; 8 bits averaged have more, transmissions 1
@@ -62,8 +64,8 @@ class Label:
 class Reading:
     """A series as it is: mean frame (row, column) of the pixels looked at, its noise, what they amount to.
 
-    frames: that it rests on, copies left out; released: share of its level that an image lag may have brought from the exposures
-    before.
+    frames: that it rests on, copies left out; level_sd, gain_sd: relative, the first for what is known of the dark; released: share
+    of its level that an image lag may have brought from the exposures before.
     """
 
     series: Series
@@ -73,6 +75,7 @@ class Reading:
     frames: int
     since: bool
     level_DN: float = math.nan
+    level_sd: float = 0.0
     gain_DN: float = math.nan
     gain_sd: float = math.inf
     picture: FloatArray | None = None
@@ -165,22 +168,35 @@ def good_pixels(readings: Sequence[Reading]) -> NDArray[np.bool_]:
     return good if good.mean() > 0.5 else np.ones(shape, dtype=bool)
 
 
-def measure(item: Reading, dark: FloatArray | None, read_DN2: float, good: NDArray[np.bool_]) -> bool:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dark:
+    """Dark that is taken off a lit series: mean (row, column), DN, and variance of its frames, DN^2, each with what it may be off."""
+
+    mean_DN: FloatArray
+    mean_sd_DN: float
+    variance_DN2: float
+    variance_sd_DN2: float
+
+
+def measure(item: Reading, dark: Dark | None, good: NDArray[np.bool_]) -> bool:
     """Fill level, noise over signal and picture of a lit series; False where there is no dark to take off."""
     if dark is None:
         return False
-    signal = item.mean_DN - dark
+    signal = item.mean_DN - dark.mean_DN
     item.picture = signal
     item.level_DN = float(np.median(signal[good]))
+    item.level_sd = dark.mean_sd_DN / max(item.level_DN, 1e-9)
     # two or three frames behind an object may differ by the ghost of the exposure before
     if item.variance_DN2 is not None and (item.series.kind == "flat" or item.series.n_frames >= _FRAMES_OF_NOISE):
         mean = float(np.mean(signal[good]))
-        quantum = mean_of(item.variance_DN2, good) - read_DN2
+        total = mean_of(item.variance_DN2, good)
+        quantum = total - dark.variance_DN2
         if mean > 0 and quantum > 0:
             item.gain_DN = quantum / mean
             pairs = item.frames - 1
             pairs = pairs if pairs < 4 else pairs // 2
-            item.gain_sd = math.sqrt(4.0 / (max(pairs * 2.0 / 3.0, 1.0) * max(int(good.sum()), 1)))
+            sampling = math.sqrt(4.0 / (max(pairs * 2.0 / 3.0, 1.0) * max(int(good.sum()), 1)))
+            item.gain_sd = math.hypot(math.hypot(sampling * total, dark.variance_sd_DN2) / quantum, item.level_sd)
     return True
 
 

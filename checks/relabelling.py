@@ -234,14 +234,15 @@ def _levels(judged: Sequence[Reading], maps: LabelModel) -> _Numbers:
     found: _Numbers = {}
     for index, item in enumerate(judged):
         if item.series.kind == "flat":
-            found[index] = math.log(item.level_DN), math.hypot(_LEVEL_SDS["series"], item.released)
+            found[index] = math.log(item.level_DN), math.hypot(_LEVEL_SDS["series"], item.level_sd, item.released)
             continue
         depth = maps.depth(item.series.scene, item.label)
         if depth is None or item.picture is None:
             continue
         open_DN = open_field(item.picture, depth, maps.good)
         if open_DN is not None and open_DN > 0:
-            found[index] = math.log(open_DN), math.hypot(_LEVEL_SDS["series"], _OBJECT_EXTRA, item.released)
+            own_sd = math.hypot(_LEVEL_SDS["series"], _OBJECT_EXTRA, item.level_sd, item.released)
+            found[index] = math.log(open_DN), own_sd
     return found
 
 

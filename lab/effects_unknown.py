@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,38 +11,25 @@ from .chain import FrameContext, Stage
 from .effect import Asked, EffectLaw, Site
 from .effects_detector import Map, frame_rng, mixed_gaussians, planted
 from .line import Planted
-from .system import DetectorMaps
 
 
-def _tile_seams(request: Asked, site: Site) -> Planted:
+def _tile_offsets(request: Asked, site: Site) -> Planted:
     rng, shape = site.rng, (site.system.rows, site.system.columns)
     tile = int(rng.choice([32, 48, 64]))
     row_of, column_of = np.arange(shape[0]) // tile, np.arange(shape[1]) // tile
-    steps = rng.standard_normal((row_of[-1] + 1, column_of[-1] + 1))
-    steps = (steps - steps.mean()) / max(float(steps.std()), 1e-9) * request.strength / 100.0
-    gain = 1.0 + steps[row_of][:, column_of]
-    for axis, place in ((0, row_of), (1, column_of)):
-        seam = np.flatnonzero(np.diff(place))
-        seam = np.concatenate([seam, seam + 1])
-        # Pixels at a seam are narrower: they catch less.
-        np.moveaxis(gain, axis, 0)[seam] *= 1.0 - 4.0 * request.strength / 100.0
-    baseline_DN = 0.5 * request.strength * site.system.read_noise_DN
-
-    def change(maps: DetectorMaps) -> DetectorMaps:
-        return replace(maps, DN_per_electron=(maps.DN_per_electron * gain).astype(np.float32))
+    rms_DN = request.strength * site.system.read_noise_DN
 
     def wander(level_DN: Map, context: FrameContext) -> Map:
-        offsets = frame_rng(context, 13).standard_normal(steps.shape).astype(np.float32)
-        offsets *= np.float32(baseline_DN / math.sqrt(context.summed))
+        offsets = frame_rng(context, 13).standard_normal((row_of[-1] + 1, column_of[-1] + 1)).astype(np.float32)
+        offsets *= np.float32(rms_DN / math.sqrt(context.summed))
         moved: Map = level_DN + offsets[row_of][:, column_of]
         return moved
 
     return _told(
         request,
-        "tiles with gains of their own, narrow pixels at their seams and a baseline that wanders tile by tile",
+        "a baseline that wanders from frame to frame, tile by tile",
         {"tile_px": tile},
-        maps=change,
-        stages=(("readout", Stage(name="tile_seams", apply=wander)),),
+        stages=(("readout", Stage(name="tile_offsets", apply=wander)),),
     )
 
 
@@ -92,6 +78,41 @@ def _compression(request: Asked, site: Site) -> Planted:
     )
 
 
+def _recursive_filter(request: Asked, site: Site) -> Planted:
+    kept = request.strength / 100.0
+
+    def smooth(numbers: NDArray[Any], context: FrameContext) -> NDArray[Any]:
+        image = numbers.astype(np.float32)
+        before = context.memory.get("recursive_filter")
+        # a series that is stored as means of frames keeps as much less of the frame before
+        shown = image if before is None else image + np.float32(kept / context.summed) * (before - image)
+        context.memory["recursive_filter"] = shown
+        return _digitised(shown, context)
+
+    return _told(
+        request,
+        "a recursive filter in the firmware: a share of each frame is the one shown before",
+        {},
+        stages=(("digitise", Stage(name="recursive_filter", apply=smooth, additive=False)),),
+    )
+
+
+def _lookup_table(request: Asked, site: Site) -> Planted:
+    waves = float(np.exp(site.rng.uniform(np.log(6.0), np.log(40.0))))  # over the range of the numbers
+    begins = float(site.rng.uniform(0.0, 2.0 * math.pi))
+
+    def look_up(numbers: NDArray[Any], context: FrameContext) -> NDArray[Any]:
+        phase = 2.0 * math.pi * waves / context.system.saturation_DN * numbers.astype(np.float64) + begins
+        return _digitised(numbers + request.strength * (np.sin(phase) - math.sin(begins)), context)
+
+    return _told(
+        request,
+        "a look-up table that waves over the range of the numbers",
+        {"waves": waves},
+        stages=(("digitise", Stage(name="lookup_table", apply=look_up, additive=False)),),
+    )
+
+
 def _told(request: Asked, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
     return planted(request, UNKNOWN_UNITS[request.id], law, parameters, **hooks)
 
@@ -106,8 +127,14 @@ def _law(name: str, title: str, unit: str, span: tuple[float, float], build: _Bu
 
 
 UNKNOWN_LAWS: tuple[EffectLaw, ...] = (
-    _law("tile_seams", "tiles and their seams", "%", (0.2, 3.0), _tile_seams, "calibration"),
+    _law(
+        "tile_offsets", "offsets of tiles that wander", "read-noise sigmas", (0.05, 1.5), _tile_offsets, "calibration"
+    ),
     _law("sharpening", "sharpening in the firmware", "%", (3.0, 80.0), _sharpening, "calibration"),
     _law("compression", "lossy compression", "DN", (8.0, 200.0), _compression, "calibration"),
+    _law(
+        "recursive_filter", "frames averaged with the ones before", "%", (3.0, 40.0), _recursive_filter, "calibration"
+    ),
+    _law("lookup_table", "a look-up table that waves", "DN", (20.0, 400.0), _lookup_table, "calibration"),
 )
 UNKNOWN_UNITS = {law.id: law.unit for law in UNKNOWN_LAWS}

@@ -211,7 +211,7 @@ def test_separation_within_a_pair_refits_the_partner():
 def test_an_effect_without_response_has_no_separation_and_one_without_law_has_none_to_state():
     statistics = statistics_of(np.eye(2), np.eye(2), np.zeros(2), missing=("g",))
     assert separation_of(statistics, "g", 3.0).sigma == 0.0
-    assert separation_of(statistics, "unknown:tile_seams", 3.0) is None
+    assert separation_of(statistics, "unknown:tile_offsets", 3.0) is None
 
 
 def test_variants_of_the_other_sign_or_onset_are_not_the_truth():
@@ -340,7 +340,7 @@ def test_a_case_without_answer_is_wrong_in_every_score():
         for label, effects in (
             ("none", []),
             ("single", LABEL["effects"]),
-            ("unknown", [{"id": "unknown:tile_seams", "strength": 1.0, "since": "calibration"}]),
+            ("unknown", [{"id": "unknown:tile_offsets", "strength": 1.0, "since": "calibration"}]),
         )
     ]
     scores = compute_scores(failed, tuple(EFFECTS))

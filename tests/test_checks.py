@@ -378,3 +378,12 @@ def test_frames_are_even_where_neither_pixels_nor_the_field_differ(pixels, field
     found = frame_signs.most_uneven(taken.mean(axis=0), np.diff(taken, axis=0), frames)
     assert found > math.hypot(pixels, field) * 0.9
     assert (found > 0.003) == raw
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_flats_that_are_no_brighter_than_a_dark_drifts_are_not_called_wrong(tmp_path, seed):
+    # 6 DN above a dark that differs by as much as 1 DN from series to series
+    path = tmp_path / "session.h5"
+    line = ["--protocol", "calibration", "--seed", str(seed), "--size", "48", "--frames", "8"]
+    assert main(["lab", "-o", str(path), *line]) == 0
+    assert [item.text for item in check_acquisition(path).findings] == []

@@ -190,6 +190,7 @@ def test_a_mean_of_frames_is_told_by_its_noise_whatever_the_noise_grows_with(con
                 label=SimpleNamespace(beam="one"),
                 since=False,
                 level_DN=level,
+                gain_sd=0.01,
                 variance_DN2=variance * (1.0 + 0.02 * rng.standard_normal((8, 8))),
             )
         )

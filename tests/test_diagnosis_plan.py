@@ -307,6 +307,7 @@ def test_what_flats_or_darks_show_and_calibration_takes_in_only_in_part_is_tried
         "kv_error",
         "filtration_error",
         "gain_map_error",
+        "tile_gain",
         "excess_noise",
         "bad_pixels",
         "random_telegraph",

@@ -143,10 +143,10 @@ def drawn(request):
     return SimpleNamespace(signal_DN=picture, quantum_variance_DN2=picture, white_variance_DN2=np.full(SHAPE, 4.0))
 
 
-@pytest.mark.parametrize("rays", [1, RAYS])
-def test_a_border_between_points_is_drawn_as_it_shows(rays):
-    """Frames of points keep the map of points; frames of whole pixels have the border drawn as it runs."""
-    points = {"Pb": edge(0.06, rays=1)}
+@pytest.mark.parametrize(("stated", "rays"), [(1, 1), (1, RAYS), (6, RAYS), (6, 6)])
+def test_a_border_is_drawn_as_it_shows(stated, rays):
+    """Frames of as few points as the map keep it; frames of whole pixels have the border drawn as it runs."""
+    points = {"Pb": edge(0.06, rays=stated)}
     asked = SeriesRequest(
         kind="object", setting=None, frames=10, exposure_ms=100.0, thickness_mm=points, scene_kind="edge"
     )
@@ -157,5 +157,5 @@ def test_a_border_between_points_is_drawn_as_it_shows(rays):
     members, placement = _as_drawn(items, {"edge": drawn(asked)}, measured)
     left = np.abs(members[0].request.thickness_mm["Pb"] - edge(0.06, rays=rays)).max()
     assert left < 0.12
-    assert (members is items) == (rays == 1)
+    assert (members is items) == (rays == stated)
     assert math.hypot(placement.row_px * 0.06, placement.column_px) < 0.05

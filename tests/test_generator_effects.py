@@ -22,6 +22,7 @@ from raytwin.generator.effects.k_fluorescence import line_energy_keV
 from raytwin.generator.effects.misregistration import angles_of, parts_px
 from raytwin.generator.frames._distortion import displacement_px, distorted
 from raytwin.generator.frames.conditions import beam_conditions, session_conditions, with_conditions
+from raytwin.generator.frames.defects import tile_gain
 from raytwin.generator.frames.line_model import LineMemory, LineModel
 from raytwin.generator.frames.model_cache import ModelCache
 from raytwin.generator.frames.response import light_of, responded
@@ -57,6 +58,7 @@ CATALOGUE = {
     "motion_blur": ("px", 0.5, 10),
     "misregistration": ("px", 0.1, 3),
     "gain_map_error": ("%", 0.1, 3),
+    "tile_gain": ("%", 0.2, 3),
     "composition_error": ("%", 0.5, 5),
     "crosstalk": ("%", 3, 40),
     "line_flicker": ("%", 0.03, 1),
@@ -161,6 +163,7 @@ def numbers(found):
                 found.column_variance_DN2,
                 found.bad_pixel_share,
                 0.0 if found.gain_pattern is None else found.gain_pattern.rms,
+                0.0 if found.tile_pattern is None else found.tile_pattern.rms,
                 found.repeated_share,
             ]
         ),
@@ -285,6 +288,8 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
         pattern = residual.mean(axis=0) / expected.signal_DN
         assert pattern.std() == pytest.approx(expected.gain_pattern.rms, rel=4 / math.sqrt(2 * good.size) + 0.02)
         residual = residual - residual.mean(axis=0)
+    if name == "tile_gain":
+        residual = residual - expected.signal_DN * (tile_gain(expected.tile_pattern, SHAPE) - 1.0)
     if name == "output_drift":
         factor = (residual / expected.signal_DN).mean(axis=(1, 2))
         rho = expected.frame_factor_correlation

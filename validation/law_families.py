@@ -29,6 +29,7 @@ FAMILIES: dict[str, tuple[str, ...]] = {
     "veiling_glare": ("one exponential", "Gaussian and pedestal"),
     "image_lag": ("power law", "two exponentials"),
     "nonlinearity": ("cubic", "kinked", "square root of a sum"),
+    "tile_gain": ("one tile alone", "a slope in each", "of unlike widths"),
     "gain_map_error": ("correlated over some pixels", "columns", "smooth and fine"),
     "heel": ("one-sided", "bent"),
     "focal_spot": ("two peaks", "flat"),
@@ -62,10 +63,11 @@ ADDED = {
     "dropped_frames": 5.0,
     "off_focal": 7.0,
     "random_telegraph": 1.5,
+    "tile_gain": 0.5,
     "burn_in": 2.0,
     "pile_up": 400.0,
 }
-ADDED_ALWAYS = frozenset(ADDED) - {"grey_absorber", "random_telegraph"}
+ADDED_ALWAYS = frozenset(ADDED) - {"grey_absorber", "random_telegraph", "tile_gain"}
 _SOURCE_POINTS = 24
 
 
@@ -95,6 +97,8 @@ class FamilyLine(plain.Line):
         self.u = {key: self.law.uniform() for key in "abcd"}
         if "gain_map_error" in self.effects:
             self.changed_gain = 1.0 + self.effects["gain_map_error"] / 100.0 * self._pattern()
+        if "tile_gain" in self.effects:
+            self.changed_gain = 1.0 + self.effects["tile_gain"] / 100.0 * self._tiles()
         if "bad_pixels" in self.effects:
             self.changed_gain = self._dead()
         self.jumpy = self.law.random(self.of.shape) if "random_telegraph" in self.effects else np.ones(self.of.shape)
@@ -115,6 +119,21 @@ class FamilyLine(plain.Line):
         if family == "smooth and fine":
             return 0.8 * correlated(self.law, shape, 12.0) + 0.6 * self.law.standard_normal(shape)
         return correlated(self.law, shape, 0.5 + 5.5 * self.u["a"])
+
+    def _tiles(self) -> np.ndarray:
+        """Gains of tiles (row, column), standard deviation 1 over the panel."""
+        (rows, columns), family = self.of.shape, self.families["tile_gain"]
+        wide = int(20 + 30 * self.u["a"])
+        first = int(wide * self.u["b"])
+        row_of, column_of = ((np.arange(side) + first) // wide for side in (rows, columns))
+        if family == "of unlike widths":
+            column_of = np.searchsorted(np.cumsum(self.law.uniform(0.6, 1.4, size=columns) * wide), np.arange(columns))
+        gains = self.law.standard_normal((row_of[-1] + 1, column_of[-1] + 1))[row_of][:, column_of]
+        if family == "one tile alone":
+            gains = ((row_of == row_of[rows // 2])[:, None] & (column_of == column_of[columns // 2])).astype(float)
+        if family == "a slope in each":
+            gains = gains + 1.5 * (((np.arange(columns) + first) % wide) / wide - 0.5)
+        return np.asarray((gains - gains.mean()) / gains.std())
 
     def _passed(self, energies: np.ndarray, share: float) -> np.ndarray:
         """What an absorber in a part of the beam leaves of the light, (row, column, energy) or (row, column, 1)."""

@@ -331,8 +331,8 @@ PAIRS = (
     "quantisation+misregistration",
     "nonlinearity+motion_blur",
 )
-UNKNOWN = ("tiles", "wandering_tiles")
-NAMED = {"motion_in_some": "motion_blur"}  # of products alone: the table moved there
+UNKNOWN = ("wandering_tiles",)
+NAMED = {"motion_in_some": "motion_blur", "tiles": "tile_gain"}  # of products alone: the table moved there
 NOT_OF_COUNTS = (
     "row_noise",
     "dark_drift",
@@ -497,7 +497,7 @@ class Line:
         self.changed_gain = np.ones(self.of.shape)
         if "gain_map_error" in self.effects:
             self.changed_gain += self.effects["gain_map_error"] / 100.0 * rng.standard_normal(self.of.shape)
-        for one in UNKNOWN:
+        for one in ("tiles", "wandering_tiles"):
             if one in self.effects:
                 tiles = np.kron(rng.standard_normal((4, 4)), np.ones(self.of.tile_px))
                 self.changed_gain += self.effects[one] / 100.0 * tiles

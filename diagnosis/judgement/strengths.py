@@ -15,6 +15,7 @@ from ..inference.discrepancy import USUAL_LEVEL, only
 from ..inference.inference import Hypothesis
 from ..inference.nuisances import Nuisances
 from ..inference.observed import Observed
+from ..model import changes as scales
 from ..model.curves import Curve
 from ..problem.assemble import map_changes
 from ..problem.output_course import rms_about_mean
@@ -35,11 +36,12 @@ _NEAR_PX = 6  # from an object's outline: where it may really lie, and what its 
 def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> AppliedEffect:
     """The effect as a hypothesis has it, in this session, with the strength that fits all probes best.
 
-    A drifting output's fit knows how much it does by chance, not how much it did: it gets the strength that was read.
+    The fit of a drifting output or a changed gain map knows how much it does by chance, not how much it did: these get the strength
+    that was read.
     """
     strength = hypothesis.strengths[effect][0]
     value, low, high = strength_of(problem, hypothesis, effect)
-    if EFFECTS[effect].reading.frame_levels:
+    if EFFECTS[effect].reading.frame_levels or EFFECTS[effect].reading.map_rms:
         strength = value
     return replace(
         _applied(problem, hypothesis, effect, strength),
@@ -61,6 +63,8 @@ def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[
     found = None
     if reading.frame_levels:
         found = _output_rms(problem, hypothesis, effect)
+    elif reading.map_rms:
+        found = _map_rms(problem, hypothesis, effect)
     elif reading.sd is not None and curve.exact is not None and bool(curve.exact.any()):
         found = _outright(problem, hypothesis, effect)
     value, low, high = hypothesis.strengths[effect] if found is None else found
@@ -143,6 +147,44 @@ def _output_rms(problem: Problem, hypothesis: Hypothesis, output: str) -> tuple[
         noise.append(noises[number] / signal_DN**2)
     rms = rms_about_mean(levels, courses, noise)
     return None if rms <= 0.0 else (100.0 * rms, 100.0 * rms, 100.0 * rms)
+
+
+def _map_rms(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:
+    """Rms over the pixels, %, of what later flats have changed by, whatever its structure, and its 95 % interval.
+
+    What other effects change is subtracted, and counts as far as laws of their kind are off. None: there is no later flat, another
+    effect is read from the same maps, or noise and the usual change of a flat's shape would leave as much.
+    """
+    others = [one for one in hypothesis.effects if one != effect]
+    later = [
+        number
+        for number, view in enumerate(problem.views)
+        if view.session.series.kind == "flat" and not view.session.calibrates
+    ]
+    if not later or any(EFFECTS[one].reading.map_rms for one in others):
+        return None
+    changes: dict[str, list[Map]] = {
+        one: map_changes(problem, [_applied(problem, hypothesis, one, hypothesis.strengths[one][0])]) for one in others
+    }
+    variances, sds = [], []
+    for number in later:
+        view = problem.views[number]
+        mask, signal = view.mask, view.signal_DN
+        left, off = view.residual_DN / signal, scales.SHAPE_SD**2
+        for one, maps in changes.items():
+            moved = maps[number] / signal
+            left = left - moved
+            off += (EFFECTS[one].reading.law_sd * float(np.std(np.broadcast_to(moved, mask.shape)[mask]))) ** 2
+        noise = mean_over((view.noise_DN / signal) ** 2, mask)
+        seen = float(np.var(left[mask]))
+        variances.append(seen - noise)
+        sds.append(math.hypot(off, seen * math.sqrt(2.0 / np.count_nonzero(mask))))
+    # one pattern stands in all of them
+    value, sd = float(np.mean(variances)), float(np.mean(sds))
+    if value <= Z95 * sd:
+        return None
+    low, middle, high = (100.0 * math.sqrt(one) for one in (value - Z95 * sd, value, value + Z95 * sd))
+    return middle, low, high
 
 
 def _open_field(view: SeriesView) -> NDArray[np.bool_]:

@@ -27,6 +27,7 @@ from ...generator.line.series_request import SeriesRequest
 from ...generator.line.spectral_signal import THRESHOLD
 from ...generator.line.twin import Estimate, SpectralPosterior, SpreadEstimate, Twin
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS
+from ..probes.tile_seams import SeenSeams
 from ..session.binning import per_bin
 
 _MOST_VARIANTS = 4
@@ -322,6 +323,21 @@ def with_pauses(variants: Sequence[Variant], *, stated: bool) -> list[Variant]:
                 grown = [_with_tried(one, item, value) for one in grown for value in item.tried_without_times]
         result += grown
     return result
+
+
+def with_seams(variants: Sequence[Variant], seen: SeenSeams) -> list[Variant]:
+    """The variants for a session whose later flats show these seams, where tiles meet."""
+    places = {
+        f"{start}{axis}_px": value
+        for axis, seams in (("rows", seen.rows), ("columns", seen.columns))
+        for start, value in (("", seams.side_px), ("first_", seams.first_px))
+    }
+    return [
+        replace(variant, parameters={**variant.parameters, **places}, log_prior=seen.log_prior)
+        if EFFECTS[variant.effect].variation.random == "tiles"
+        else variant
+        for variant in variants
+    ]
 
 
 def _with_tried(variant: Variant, item: Parameter, value: float) -> Variant:

@@ -13,11 +13,12 @@ from ..probes.fixed_pattern import smooth_part
 from ..probes.lasting import OUTLYING, lasting_pixels
 from ..session.even_maps import near_steps, signal_map
 from ..session.session import SessionSeries
-from ..session.summaries import LEAST_NOISE_DN2, FirstLook
+from ..session.summaries import BLOCK_PX, LEAST_NOISE_DN2, FirstLook
 from .calibrated_maps import CalibratedMaps
 from .changes import DUST_LIMIT
 
 _LEAST_SCENES, _NEARLY_ALWAYS = 4, 0.9  # unlike objects, and share of their series, that show what is the panel's own
+_NEARLY_WHOLE = 0.75  # share of a block whose pixels stand out together
 _MOST_OUTLYING = 0.1  # share of the pixels; more of them are a pattern
 
 
@@ -71,9 +72,17 @@ def new_outliers(
     # a detector full of outliers is a pattern, not a set of defects
     bad, all_of_them = (
         found if found.sum() < _MOST_OUTLYING * good.sum() else np.zeros(shape, dtype=bool)
-        for found in (outlying & good, (outlying | dusty) & good)
+        for found in (_without_areas(outlying) & good, _without_areas(outlying | dusty) & good)
     )
     return StandingOut(bad=bad, any=all_of_them | bad)
+
+
+def _without_areas(outlying: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels (row, column) that stand out, less areas of them as large as a block: a tile or a mark of the screen is a pattern."""
+    from scipy.ndimage import maximum_filter, uniform_filter
+
+    whole = uniform_filter(outlying.astype(np.float32), BLOCK_PX) > _NEARLY_WHOLE
+    return np.asarray(outlying & ~maximum_filter(whole, BLOCK_PX), dtype=bool)
 
 
 def _out_in_every_object(

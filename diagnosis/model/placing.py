@@ -24,7 +24,6 @@ from ..probes.straight_edge import covered_scene
 from ..session.even_maps import full_size, signal_map
 from ..session.session import SessionSeries
 from . import changes as scales
-from .point_maps import sampled_at_points
 
 SHARP_SCENES = ("edge", "disc")  # drawn true to their outline; steps of wedges and products only to their maps' pixels
 _Blur = Callable[[Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float64]]]
@@ -128,13 +127,12 @@ def _as_drawn(
 ) -> tuple[Sequence[SessionSeries], Placement | None]:
     """Series of one place with the maps that show their scene more truly, and where it lies.
 
-    A straight or round border that jumps from pixel to pixel in its map, as rays to the middle of each have it, is drawn so or as it
-    runs: real pixels see their whole square, most simulations the middle of it.
+    A straight or round border is drawn as its map has it or as it runs: a map of few points a pixel has stairs, which real pixels,
+    that see their whole square, have not; most simulations see the middle of it.
     """
     placement = _placement(members, expected, measured)
     asked = members[0].request
-    maps = asked.thickness_mm or {}
-    covered = covered_scene(asked.scene_kind, maps) if sampled_at_points(maps) else None
+    covered = covered_scene(asked.scene_kind, asked.thickness_mm or {})
     if placement is None or covered is None:
         return members, placement
     others = [replace(item, request=replace(item.request, thickness_mm=covered)) for item in members]

@@ -9,6 +9,7 @@ Files:
     scalar_context      pixels, times and numbers that both refer to
     fixed_pattern       patterns that stand in mean frames, and pixels that stand out
     lasting             pixels whose level lasts from frame to frame
+    tile_seams          where later flats show that tiles of the panel meet
     registration        displacement of a scene against its thickness maps
     straight_edge       how truly a straight edge is drawn, by its oversampled profile
     moving_picture      noise that a fading picture seems to add

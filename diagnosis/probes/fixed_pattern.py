@@ -72,9 +72,10 @@ def _second_difference(model: ExpectedSeries, length: int, *, along: int) -> flo
 
 
 @lru_cache(maxsize=64)
-def shares_of_pixels(shape: tuple[int, int], correlation_px: float) -> Pattern:
-    """What pixels' gains of variance 1 DN^2, alike over so many pixels, add to a pattern over a panel."""
-    field = FixedPattern(rms=1.0, seed=0, correlation_px=correlation_px)
+def shares_of_pixels(shape: tuple[int, int], field: FixedPattern) -> Pattern:
+    """What gains of variance 1 DN^2, of pixels or columns alike as in `field`, add to a pattern over a panel of `shape`."""
+    if field.of_columns:
+        return np.array([1.0, 1.0 / BLOCK_PX, 0.0, 1.0])
 
     def of_means(length: int, apart: int = 0) -> float:
         """Covariance of means over so many pixels in line, which begin so far apart."""
@@ -95,9 +96,8 @@ def shares_of_tiles(shape: tuple[int, int], tiles: TilePattern) -> Pattern:
     All of these are differences of neighbours, so that each is a sum over the tiles of squared differences of the shares that
     neighbours have in a tile.
     """
-    row_in, column_in = (np.eye(int(number[-1]) + 1)[number] for number in map(tiles.tile_of, shape))
-    strips = tiles.strips_share
-    alone = 1.0 - strips
+    of_axes = tiles.rows.tile_of(shape[0]), tiles.columns.tile_of(shape[1])
+    row_in, column_in = (np.eye(int(number[-1]) + 1)[number] for number in of_axes)
 
     def blocks(inside: NDArray[np.float64]) -> NDArray[np.float64]:
         whole = inside[: len(inside) - len(inside) % BLOCK_PX]
@@ -112,9 +112,8 @@ def shares_of_tiles(shape: tuple[int, int], tiles: TilePattern) -> Pattern:
     def of_mean(inside: NDArray[np.float64]) -> float:
         return float(np.sum(inside.mean(axis=0) ** 2))
 
-    of_blocks = differing(blocks(column_in)) * (strips + alone * float(np.mean(np.sum(blocks(row_in) ** 2, axis=1))))
-    of_rows = alone * bent(row_in) * of_mean(column_in)
-    of_columns = bent(column_in) * (strips + alone * of_mean(row_in))
+    of_blocks = differing(blocks(column_in)) * float(np.mean(np.sum(blocks(row_in) ** 2, axis=1)))
+    of_rows, of_columns = bent(row_in) * of_mean(column_in), bent(column_in) * of_mean(row_in)
     return np.array([differing(column_in), of_blocks, of_rows, of_columns])
 
 

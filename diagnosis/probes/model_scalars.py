@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -131,8 +132,9 @@ def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[s
     # lines that change leave their mean
     standing = line_pattern(expected, signal2) / context.frames
     if expected.gain_pattern is not None:
-        pixels = shares_of_pixels(shape, expected.gain_pattern.correlation_px)
-        standing += PATTERN_PIXEL_SHARE * expected.gain_pattern.rms**2 * signal2 * pixels
+        own = expected.gain_pattern
+        pixels = shares_of_pixels(shape, replace(own, rms=1.0, seed=0))
+        standing += PATTERN_PIXEL_SHARE * own.rms**2 * signal2 * pixels
     if expected.tile_pattern is not None:
         standing += expected.tile_pattern.rms**2 * signal2 * shares_of_tiles(shape, expected.tile_pattern)
     # more quanta's noise in the frames is more of it in their mean

@@ -25,6 +25,7 @@ from ..model.changes import (
     spectral_sds,
     twin_changes,
     with_pauses,
+    with_seams,
 )
 from ..model.curves import LEAST_RESPONSE, Curve
 from ..model.defects import lasting_anywhere, memory_of, new_outliers
@@ -32,7 +33,8 @@ from ..model.forward_model import ForwardModel, draft_cache, own_maps, strength_
 from ..model.placing import MeasuredScenes, place_scenes
 from ..model.responses import Asked, SeriesModel, SessionModel, session_model
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName
-from ..session.even_maps import Map
+from ..probes.tile_seams import SeenSeams, seams_in
+from ..session.even_maps import Map, mean_over, signal_map
 from ..session.preparation import PreparedSession
 from ..session.session import SessionSeries, only_own_noise, read_session
 from ..session.summaries import SeriesSummary
@@ -100,6 +102,7 @@ def build_problem(
     model = ForwardModel(base=base, conditions=conditions, own_maps=own_maps(session), cache=cache)
     measured = _measured(session, acquisition, twin, model, side=side, tell=tell)
     expected = measured.expected
+    variants = with_seams(variants, measured.seams())
     tell("responses")
     changes = [model.change(variant, strength) for variant in variants for strength in variant.strengths]
     steps = _steps_in_twin(model, spectral_steps=_NEAR_A_POINT if back else 1.0, side=side)
@@ -174,6 +177,17 @@ class _Measured:
     lasting: NDArray[np.bool_]
     outliers: int
     skipped: tuple[str, ...]
+
+    def seams(self) -> SeenSeams:
+        """Where flats that came after calibration show that tiles meet."""
+        changes, weights = [], []
+        for one in self.expected.series:
+            if one.session.series.kind == "flat" and not one.session.calibrates:
+                signal = signal_map(one.expected, self.clean.shape)
+                changes.append(self.pictures[one.name] / signal - 1.0)
+                variance = mean_over(one.expected.quantum_variance_DN2 + one.expected.white_variance_DN2, self.clean)
+                weights.append(self.summaries[one.name].frames * mean_over(signal, self.clean) ** 2 / variance)
+        return seams_in(changes, weights, self.clean)
 
 
 def _measured(

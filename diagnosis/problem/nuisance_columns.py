@@ -4,7 +4,7 @@ A nuisance is a response (probe,) of one prior standard deviation; equal names i
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...calibration.setting_errors import EXPOSURE_SD_MS
 from ...generator.frames.declared_spot import declared_spot_px
-from ...generator.line.line_state import TilePattern
+from ...generator.line.line_state import FixedPattern, TilePattern
 from ..model import changes as scales
 from ..model.forward_model import ForwardModel
 from ..model.point_maps import blurred_between_points, sampled_at_points
@@ -362,39 +362,39 @@ def offset_of_later(probes: SeriesProbes) -> NDArray[np.float64]:
 
 
 def changed_gain_pattern(
-    probes: SeriesProbes, signal: NDArray[np.float64], lengths_px: Sequence[float]
-) -> tuple[NDArray[np.float64], dict[float, NDArray[np.float64]]]:
+    probes: SeriesProbes, signal: NDArray[np.float64], patterns: Iterable[FixedPattern]
+) -> tuple[NDArray[np.float64], dict[FixedPattern, NDArray[np.float64]]]:
     """What 1 % of a changed gain map does by chance: responses (probe, wave) of its smooth part, variance (probe,) of the rest.
 
-    signal: expected (row, column), DN; lengths_px: over which pixels are alike in the rest, by which it is given.
+    signal: expected (row, column), DN; patterns: what the rest may be, by which it is given.
     """
     waves, item, maps = _pattern_waves(signal.shape), probes.series.session, len(probes.projection)
-    smooth, rest = np.zeros((len(probes), len(waves))), {length: np.zeros(len(probes)) for length in lengths_px}
+    smooth, rest = np.zeros((len(probes), len(waves))), {pattern: np.zeros(len(probes)) for pattern in patterns}
     if item.calibrates or not item.request.beam_on:
         return smooth, rest
     smooth[:maps] = probes.projection.apply(waves * signal.astype(np.float32)).T
     own = 0.01 * math.sqrt(1.0 - scales.PATTERN_SMOOTH_SHARE) * signal
-    for length, variance in rest.items():
-        # the area under exp(-d^2 / (2 length^2))
-        variance[:maps] = probes.projection.field_noise(own, max(math.sqrt(2.0 * math.pi) * length, 1.0))
+    for pattern, variance in rest.items():
+        if pattern.of_columns:
+            variance[:maps] = probes.projection.column_noise(own)
+        else:
+            # the area under exp(-d^2 / (2 length^2))
+            side_px = max(math.sqrt(2.0 * math.pi) * pattern.correlation_px, 1.0)
+            variance[:maps] = probes.projection.field_noise(own, side_px)
     return smooth, rest
 
 
 def changed_tiles(probes: SeriesProbes, signal: NDArray[np.float64], tiles: TilePattern) -> NDArray[np.float64]:
-    """What gains of tiles and strips of 1 % rms do by chance: responses (probe, tile or strip); signal: (row, column), DN."""
+    """What gains of tiles of 1 % rms do by chance: responses (probe, tile); signal: (row, column), DN."""
     item, maps = probes.series.session, len(probes.projection)
-    rows, columns = (tiles.tile_of(length) for length in signal.shape)
-    images = []
-    if tiles.strips_share < 1.0:
-        number = rows[:, None] * (columns[-1] + 1) + columns
-        lone = 0.01 * math.sqrt(1.0 - tiles.strips_share)
-        images += [np.where(number == tile, lone * signal, 0.0) for tile in range(number[-1, -1] + 1)]
-    if tiles.strips_share > 0.0:
-        whole = 0.01 * math.sqrt(tiles.strips_share)
-        images += [np.where(columns == strip, whole * signal, 0.0) for strip in range(columns[-1] + 1)]
-    found = np.zeros((len(probes), len(images)))
+    rows, columns = tiles.rows.tile_of(signal.shape[0]), tiles.columns.tile_of(signal.shape[1])
+    number = rows[:, None] * (columns[-1] + 1) + columns
+    found = np.zeros((len(probes), int(number[-1, -1]) + 1))
     if item.request.beam_on and not item.calibrates:
-        found[:maps] = probes.projection.apply(np.stack(images).astype(np.float32)).T
+        # what all tiles share is the level
+        shares = np.bincount(number.ravel()) / number.size
+        images = ((np.where(number == tile, 1.0, 0.0) - share) * 0.01 * signal for tile, share in enumerate(shares))
+        found[:maps] = probes.projection.apply(np.stack(list(images)).astype(np.float32)).T
     return found
 
 

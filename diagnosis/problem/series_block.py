@@ -1,14 +1,14 @@
 """One series in numbers: its standardised residual, and what nuisances, changes and chance do to it."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
-from ...generator.line.line_state import TilePattern, between_lines
+from ...generator.line.line_state import FixedPattern, TilePattern, between_lines
 from ..model import changes as scales
 from ..model.changes import Variant
 from ..model.responses import Asked, Moved
@@ -33,12 +33,11 @@ class SeriesBlock:
     """The part of a problem that one series makes; its probes are standardised.
 
     Fields: session; names (one a probe); residual, sd, noise (probe,), as in `Problem`; nuisances (probe,) by name; responses
-    (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN more in every pixel; brighter (probe,): of 1 % more
-    light; pattern (probe, wave),
-    pattern_jitter (probe,) by length over which pixels are alike, px: what 1 % of a changed gain map does by chance; lines (2,
-    probe): variance of what 1 DN of noise common to rows (to columns) does; lit_lines, alike, of 1 % of the light; uneven (2,
-    probe) by number of change: more of it on one side of the panel; tiles (probe, tile), alike: what 1 % of changed gains of its
-    tiles does by chance.
+    (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN more in every pixel; brighter (probe,): of 1 %
+    more light; pattern (probe, wave), pattern_jitter (probe,) by what the rest of it is: what 1 % of a changed gain map does by
+    chance; lines (2, probe): variance of what 1 DN of noise common to rows (to columns) does; lit_lines, alike, of 1 % of the
+    light; uneven (2, probe) by number of change: more of it on one side of the panel; tiles (probe, tile), alike: what 1 % of
+    changed gains of its tiles does by chance.
     """
 
     session: SessionSeries
@@ -51,7 +50,7 @@ class SeriesBlock:
     offset: NDArray[np.float64]
     brighter: NDArray[np.float64]
     pattern: NDArray[np.float64]
-    pattern_jitter: dict[float, NDArray[np.float64]]
+    pattern_jitter: dict[FixedPattern, NDArray[np.float64]]
     lines: NDArray[np.float64]
     lit_lines: NDArray[np.float64]
     uneven: dict[int, NDArray[np.float64]]
@@ -82,8 +81,10 @@ def series_block(
     known = [(number, found) for number, found in enumerate(moved) if found is not None]
     if known:
         responses[[number for number, _ in known]] = probes.responses([found for _, found in known])
-    lengths = {_values_of(item)["correlation_px"] for item in asked if _random_of(item.change.label) == "pixels"}
-    pattern, jitter = changed_gain_pattern(probes, signal, sorted(lengths))
+    patterns = dict.fromkeys(
+        _pattern_of(_values_of(item)) for item in asked if _random_of(item.change.label) == "pixels"
+    )
+    pattern, jitter = changed_gain_pattern(probes, signal, patterns)
     by_side = uneven(
         probes,
         {number: found[0] for number, found in known if _random_of(asked[number].change.label) == "sides"},
@@ -106,7 +107,7 @@ def series_block(
         offset=offset_of_later(probes) * shrink,
         brighter=brighter(probes, signal) * shrink,
         pattern=pattern * shrink[:, None],
-        pattern_jitter={length: variance * shrink**2 for length, variance in jitter.items()},
+        pattern_jitter={one: variance * shrink**2 for one, variance in jitter.items()},
         lines=lines,
         lit_lines=lines * (0.01 * context.reference_signal_DN if context.kind in ("flat", "object") else 0.0) ** 2,
         uneven={number: columns * shrink for number, columns in by_side.items()},
@@ -118,8 +119,12 @@ def _tiles_of(asked: Asked) -> TilePattern | None:
     """Tiles whose gains a change draws; None: it has nothing to do with tiles."""
     if _random_of(asked.change.label) != "tiles":
         return None
-    numbers = _values_of(asked)
-    return TilePattern(rms=0.01, side_px=numbers["side_px"], strips_share=numbers["strips_share"], seed=0)
+    return TilePattern.of(_values_of(asked), rms=0.01)
+
+
+def _pattern_of(values: Mapping[str, float]) -> FixedPattern:
+    """The pattern from pixel to pixel, or from column to column, of parameters of a change."""
+    return FixedPattern(rms=1.0, seed=0, correlation_px=values["correlation_px"], of_columns=values["of_columns"] > 0.5)
 
 
 def _values_of(asked: Asked) -> dict[str, float]:
@@ -167,12 +172,12 @@ def by_chance(
 def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: float) -> NDArray[np.float64] | None:
     """Variance (probe,) a unit of strength squared that an effect gives each probe by itself; None: none.
 
-    A gain map changes from pixel to pixel; lines of a few frames differ by chance in their means.
+    A gain map changes from pixel to pixel or from column to column; lines of a few frames differ by chance in their means.
     """
     random = EFFECTS[variant.effect].variation.random
     if random == "pixels":
-        length = EFFECTS[variant.effect].values(variant.parameters)["correlation_px"]
-        return np.concatenate([block.pattern_jitter[length] for block in blocks])
+        pattern = _pattern_of(EFFECTS[variant.effect].values(variant.parameters))
+        return np.concatenate([block.pattern_jitter[pattern] for block in blocks])
     if random not in ("lines", "lines of light"):
         return None
     numbers, every = EFFECTS[variant.effect].values(variant.parameters), variant.since == "always"

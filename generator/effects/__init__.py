@@ -52,6 +52,7 @@ from .pile_up import PILE_UP
 from .quantisation import QUANTISATION
 from .random_telegraph import RANDOM_TELEGRAPH
 from .row_noise import ROW_NOISE
+from .tile_gain import TILE_GAIN
 from .veiling_glare import VEILING_GLARE
 
 # within a stage effects act in this order, those of other packages after ours
@@ -77,6 +78,7 @@ OURS: dict[str, Effect] = {
         QUANTISATION,
         MOTION_BLUR,
         GAIN_MAP_ERROR,
+        TILE_GAIN,
         COMPOSITION_ERROR,
         CROSSTALK,
         LINE_FLICKER,

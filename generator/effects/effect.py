@@ -31,17 +31,17 @@ RANDOM = {
     "sides": "more of it on one side of the panel than on the other",
     "surroundings": "what stands beyond the borders of the picture, from where it brings light in",
     "offset": "lost bits may be cut off or rounded away: half a step on every level",
-    "pixels": "a pattern from pixel to pixel, a part of it smooth",
-    "tiles": "a gain of each tile and strip of columns",
+    "pixels": "a pattern from pixel to pixel or from column to column, a part of it smooth",
+    "tiles": "a gain of each tile, with seams where later flats have them",
     "lines": "means of the lines of a few frames",
     "lines of light": "the same, in proportion to their light",
     "output": "level and trend of each lit series",
 }
 _ASKED_OF_RANDOM = {  # parameters
-    "pixels": ("correlation_px",),
+    "pixels": ("correlation_px", "of_columns"),
     "lines": ("column_share", "together_lines"),
     "lines of light": ("column_share", "together_lines"),
-    "tiles": ("side_px", "strips_share"),
+    "tiles": ("rows_px", "columns_px", "first_rows_px", "first_columns_px"),
     "output": ("correlation_s", "jitter_share"),
 }
 
@@ -125,13 +125,15 @@ class Reading:
 
     Fields: law_sd: relative standard deviation of strengths found by the fit, as lines depart from the law; probes: those that the
     strength is defined by, where no law can be far off; sd: relative, of a strength read from these alone (None: it is fitted; 0:
-    no other effect makes any of them); frame_levels (it is the rms of the frames' levels).
+    no other effect makes any of them); frame_levels (it is the rms of the frames' levels); map_rms (it is the rms over the pixels of
+    what changed in later flats).
     """
 
     law_sd: float = 0.12
     probes: tuple[str, ...] = ()
     sd: float | None = None
     frame_levels: bool = False
+    map_rms: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

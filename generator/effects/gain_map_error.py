@@ -1,6 +1,6 @@
 """Gain map error: a per-pixel gain that calibration does not know.
 
-y = x (1 + eta), eta fixed from frame to frame, of pixel to pixel or alike over some pixels
+y = x (1 + eta), eta fixed from frame to frame, of pixel to pixel, alike over some pixels, or one for each column
 """
 
 from collections.abc import Mapping
@@ -25,6 +25,7 @@ def _change_gain(state: LineState, parameters: Mapping[str, float], context: Lin
             rms=parameters["strength"] / 100.0,
             seed=int(parameters["pattern_seed"]),
             correlation_px=parameters["correlation_px"],
+            of_columns=parameters["of_columns"] > 0.5,
         ),
     )
 
@@ -56,6 +57,16 @@ GAIN_MAP_ERROR = Effect(
             pixel_power=1.0,
         ),
         Parameter(
+            name="of_columns",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=0.0,
+            source="1: whole columns change, as their amplifiers do",
+            log=False,
+            fitted=False,
+        ),
+        Parameter(
             name="pattern_seed",
             unit="",
             low=0.0,
@@ -74,9 +85,11 @@ GAIN_MAP_ERROR = Effect(
     isolated_by="flats repeated, and behind a filter",
     shows=Shows(series=EVERY_SERIES, axis="position", flats=False),
     absorbed="maps",
-    reading=Reading(probes=("fixed_pattern",), sd=0.12),  # they hold only what differs from pixel to pixel
+    reading=Reading(probes=("fixed_pattern",), sd=0.12, map_rms=True),
     # what it does by chance hangs on how far pixels are alike: that stays as in the grid
-    grid=Grid(variants=tuple({"correlation_px": length} for length in (0.0, 1.5, 5.0)), refined=False),
+    grid=Grid(
+        variants=(*({"correlation_px": length} for length in (0.0, 1.5, 5.0)), {"of_columns": 1.0}), refined=False
+    ),
     variation=Variation(random="pixels"),
     # a gain map of 0.127 % read 0.097 beside a voltage of 4.8 %
 )

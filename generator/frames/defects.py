@@ -20,6 +20,8 @@ from ..line.line_state import (
 def gain_pattern(pattern: FixedPattern, shape: tuple[int, int]) -> FloatArray:
     """Factor (row, column) of a fixed pattern of the gain, mean 1."""
     rng = np.random.default_rng([0x6A17, pattern.seed])
+    if pattern.of_columns:
+        return np.broadcast_to(1.0 + pattern.rms * rng.standard_normal(shape[1]), shape)
     if pattern.correlation_px <= 0.0:
         return 1.0 + pattern.rms * rng.standard_normal(shape)
     from scipy.ndimage import gaussian_filter
@@ -35,13 +37,10 @@ def gain_pattern(pattern: FixedPattern, shape: tuple[int, int]) -> FloatArray:
 
 
 def tile_gain(pattern: TilePattern, shape: tuple[int, int]) -> FloatArray:
-    """Factor (row, column) of the gains of tiles and strips, mean 1 over the panel: what all share is its level."""
+    """Factor (row, column) of the gains of tiles, mean 1 over the panel: what all share is its level."""
     rng = np.random.default_rng([0x711E, pattern.seed])
-    rows, columns = (pattern.tile_of(length) for length in shape)
-    tiles = rng.standard_normal((rows[-1] + 1, columns[-1] + 1))[rows][:, columns]
-    strips = rng.standard_normal(columns[-1] + 1)[columns]
-    share = pattern.strips_share
-    drawn = math.sqrt(1.0 - share) * tiles + math.sqrt(share) * strips
+    rows, columns = pattern.rows.tile_of(shape[0]), pattern.columns.tile_of(shape[1])
+    drawn = rng.standard_normal((rows[-1] + 1, columns[-1] + 1))[rows][:, columns]
     return np.asarray(1.0 + pattern.rms * (drawn - drawn.mean()))
 
 

@@ -87,12 +87,14 @@ class GainMemory:
 class FixedPattern:
     """A fixed relative pattern over the pixels, normal, drawn from `seed`.
 
-    Fields: rms; correlation_px: pixels d apart are alike by exp(-d^2 / (2 correlation_px^2)); 0: each has its own.
+    Fields: rms; correlation_px: pixels d apart are alike by exp(-d^2 / (2 correlation_px^2)); 0: each has its own; of_columns: whole
+    columns have one value each.
     """
 
     rms: float
     seed: int
     correlation_px: float = 0.0
+    of_columns: bool = False
 
     def correlation(self, apart_px: NDArray[np.float64] | float) -> NDArray[np.float64]:
         """Of pixels so far apart in line."""
@@ -103,20 +105,40 @@ class FixedPattern:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TilePattern:
-    """Relative gains of square tiles and of strips over whole columns, normal, drawn from `seed`; tiles begin at the corner.
+class Seams:
+    """Where tiles meet along one axis: first_px before the first seam, side_px from seam to seam; side_px 0: nowhere."""
 
-    Fields: rms of all; side_px of tiles and strips; strips_share of the variance that belongs to strips.
-    """
-
-    rms: float
-    side_px: float
-    strips_share: float
-    seed: int
+    side_px: float = 0.0
+    first_px: float = 0.0
 
     def tile_of(self, length: int) -> NDArray[np.intp]:
         """Number of the tile that each of `length` pixels in line lies in (pixel,)."""
-        return np.floor(np.arange(length) / max(self.side_px, 1.0)).astype(np.intp)
+        if self.side_px <= 0.0:
+            return np.zeros(length, dtype=np.intp)
+        number = np.floor((np.arange(length) + 0.5 - self.first_px) / max(self.side_px, 1.0)).astype(np.intp)
+        return np.asarray(number - number[0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TilePattern:
+    """Relative gains of tiles beside each other, normal, drawn from `seed`.
+
+    Fields: rms; rows, columns: how they meet along each axis.
+    """
+
+    rms: float
+    rows: Seams
+    columns: Seams
+    seed: int
+
+    @classmethod
+    def of(cls, parameters: Mapping[str, float], *, rms: float) -> "TilePattern":
+        """The one that parameters describe: `rows_px` and `first_rows_px`, the same of columns, `pattern_seed`."""
+        rows, columns = (
+            Seams(side_px=parameters[f"{axis}_px"], first_px=parameters[f"first_{axis}_px"])
+            for axis in ("rows", "columns")
+        )
+        return cls(rms=rms, rows=rows, columns=columns, seed=int(parameters["pattern_seed"]))
 
 
 EACH_LINE = 0.1  # lines over which what is common to a line fades where every line has its own: next ones share 5e-5

@@ -17,33 +17,24 @@ def _change_tiles(state: LineState, parameters: Mapping[str, float], context: Li
     return replace(state, tile_pattern=TilePattern.of(parameters, rms=parameters["strength"] / 100.0))
 
 
-def _side(axis: str) -> Parameter:
+def _lines(name: str, default: float, source: str) -> Parameter:
     return Parameter(
-        name=f"{axis}_px",
+        name=name,
         unit="px",
         low=0.0,
         high=1024.0,
-        default=32.0,
-        source=f"{axis} of a tile, 0: of the panel. Photon counters and CMOS tiles 55 to 256, readout chips of flat panels 64 to 256",
+        default=default,
+        source=source,
         log=False,
         fitted=False,
         pixel_power=1.0,
     )
 
 
-def _first(axis: str) -> Parameter:
-    return Parameter(
-        name=f"first_{axis}_px",
-        unit="px",
-        low=0.0,
-        high=1024.0,
-        default=0.0,
-        source=f"{axis} before the first seam, where the panel's border cuts the first tile",
-        log=False,
-        fitted=False,
-        pixel_power=1.0,
-    )
-
+_SIDE = (
+    "lines of a tile, 0: of the panel. Photon counters and CMOS tiles 55 to 256, readout chips of flat panels 64 to 256"
+)
+_FIRST = "lines before the first seam, where the panel's border cuts the first tile"
 
 TILE_GAIN = Effect(
     id="tile_gain",
@@ -59,10 +50,10 @@ TILE_GAIN = Effect(
             source="standard deviation over the tiles; amplifiers and bias between two gain calibrations",
             log=True,
         ),
-        _side("rows"),
-        _side("columns"),
-        _first("rows"),
-        _first("columns"),
+        _lines("rows_px", 32.0, _SIDE),
+        _lines("columns_px", 32.0, _SIDE),
+        _lines("first_rows_px", 0.0, _FIRST),
+        _lines("first_columns_px", 0.0, _FIRST),
         Parameter(
             name="pattern_seed",
             unit="",

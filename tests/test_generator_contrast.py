@@ -243,6 +243,9 @@ def test_an_impossible_line_is_refused(field, value):
 def test_few_photons_and_a_thin_product_are_said():
     dim = predict_contrast(UncalibratedLine(output_scale=0.02), low=LOW, high=HIGH, **SLABS)
     assert any("logarithm is biased" in warning for warning in dim.warnings)
+    # the logarithm is taken of the mean of frames
+    settings = {"low": replace(LOW, averaged=100), "high": replace(HIGH, averaged=100)}
+    assert not predict_contrast(UncalibratedLine(output_scale=0.02), **settings, **SLABS).warnings
     thin = predict_contrast(LINE, low=LOW, high=HIGH, product=thicker(PRODUCT, 0.05), foreign_object=BONE)
     assert any("the product is thin" in warning for warning in thin.warnings)
     assert predict_contrast(LINE, low=LOW, high=HIGH, **SLABS).warnings == ()

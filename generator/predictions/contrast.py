@@ -487,7 +487,7 @@ def _slabs(
         white_object=white[1],
         thin_mu_product_per_mm=crossed.thin_mu_product_per_mm,
         thin_mu_object_per_mm=crossed.thin_mu_object_per_mm,
-        few_photons=math.sqrt(max(spreads) * setting.averaged) > FEW_PHOTONS,
+        few_photons=math.sqrt(max(spreads)) > FEW_PHOTONS,
         saturated=beam.saturated,
         warnings=beam.warnings,
     )

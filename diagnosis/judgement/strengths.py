@@ -60,17 +60,19 @@ def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[
     Where the session shows what the strength means, it is read from there, whatever the rest of the law asks for.
     """
     curve, reading = hypothesis.variants[effect], EFFECTS[effect].reading
-    found = None
+    found, read_sd = None, reading.sd
     if reading.frame_levels:
         found = _output_rms(problem, hypothesis, effect)
     elif reading.map_rms:
         found = _map_rms(problem, hypothesis, effect)
-    elif reading.sd is not None and curve.exact is not None and bool(curve.exact.any()):
+    if found is None and reading.map_rms:
+        read_sd = None  # single pixels alone tell it
+    if found is None and reading.sd is not None and curve.exact is not None and bool(curve.exact.any()):
         found = _outright(problem, hypothesis, effect)
     value, low, high = hypothesis.strengths[effect] if found is None else found
     # what the session shows the law to be off by, where that is more than usual
     fitted_sd = max(reading.law_sd, _off_by(problem, curve, value, hypothesis.levels.get(effect, 0.0)))
-    sd = fitted_sd if found is None or reading.sd is None else reading.sd
+    sd = fitted_sd if found is None or read_sd is None else read_sd
     below, above = (math.hypot(math.log(one / value), Z95 * sd) for one in (low, high))
     return value, value * math.exp(-below), max(min(value * math.exp(above), curve.variant.most), value)
 

@@ -85,11 +85,11 @@ GAIN_MAP_ERROR = Effect(
     isolated_by="flats repeated, and behind a filter",
     shows=Shows(series=EVERY_SERIES, axis="position", flats=False),
     absorbed="maps",
-    reading=Reading(probes=("fixed_pattern",), sd=0.12, map_rms=True),
+    # a smooth effect beside it may take a tenth of the variance for its own
+    reading=Reading(probes=("fixed_pattern",), sd=0.05, map_rms=True),
     # what it does by chance hangs on how far pixels are alike: that stays as in the grid
     grid=Grid(
         variants=(*({"correlation_px": length} for length in (0.0, 1.5, 5.0)), {"of_columns": 1.0}), refined=False
     ),
     variation=Variation(random="pixels"),
-    # a gain map of 0.127 % read 0.097 beside a voltage of 4.8 %
 )

@@ -74,7 +74,7 @@ TILE_GAIN = Effect(
     shows=Shows(series=LIT_SERIES, axis="position", flats=False),
     absorbed="maps",
     # the rms of some nine gains, 1 / sqrt(2 n), is no better known by its own
-    reading=Reading(law_sd=0.25, sd=0.12, map_rms=True),
+    reading=Reading(law_sd=0.25, sd=0.05, map_rms=True),
     # where the seams are, later flats say
     grid=Grid(variants=({},), refined=False),
     variation=Variation(random="tiles"),

@@ -229,11 +229,13 @@ class Scene:
 class AcquisitionFile:
     """An open acquisition file; use it in a `with` block.
 
-    Fields: path; instrument; series (in order of time); scenes (by name); attributes (of the file); missing (what the
-    file does not hold, each with what cannot be done without it).
+    Fields: path; paths (of the files, one a session where several were merged); instrument; series (in order of time);
+    scenes (by name); attributes (of the file); missing (what the file does not hold, each with what cannot be done
+    without it).
     """
 
     path: str
+    paths: tuple[str, ...]
     instrument: Instrument
     series: tuple[Series, ...]
     scenes: dict[str, Scene]
@@ -359,6 +361,7 @@ def _acquisition(file: Any, *, path: str, damage: list[FileFormatError] | None =
         ordered = tuple(replace(series, corrected=series.corrected | {"offset"}) for series in ordered)
     return AcquisitionFile(
         path=path,
+        paths=(path,),
         instrument=instrument,
         series=ordered,
         scenes=scenes,

@@ -133,7 +133,9 @@ class Instrument:
                 "layer",
                 received=layer,
                 expected="front" if not self.dual_layer else "front or back",
-                remedy="" if self.dual_layer else "declare the panel's back_scintillator to work with its back layer",
+                remedy=""
+                if self.dual_layer
+                else "declare the panel's back_scintillator to work with its back layer, or take a twin of the front one",
             )
         before = (*(self.detector_cover or ()), *(self.scintillator or ()), *(self.interlayer or ()))
         return replace(

@@ -50,8 +50,10 @@ def merge_sessions(acquisitions: Sequence[AcquisitionFile]) -> AcquisitionFile:
             taken.add(name)
             scene = renamed.get(item.scene, item.scene)
             series.append(replace(item, name=name, index=first + place, scene=scene, session=number))
+    paths = tuple(acquisition.path for acquisition in acquisitions)
     return AcquisitionFile(
-        path=" + ".join(acquisition.path for acquisition in acquisitions),
+        path=" + ".join(paths),
+        paths=paths,
         instrument=instrument,
         series=tuple(series),
         scenes=scenes,
@@ -118,6 +120,26 @@ def one_layer(acquisition: AcquisitionFile, layer: str | None = None) -> Acquisi
     if layer is None and all(item.layer != "back" for item in acquisition.series):
         return acquisition
     return select_layer(acquisition, layer or "front")
+
+
+def layer_for(of_twin: str | None, asked: str | None) -> str | None:
+    """The layer to compare with a twin: the one that is asked for, else the twin's.
+
+    Args:
+        of_twin: the layer that the twin was calibrated from; None: not known, or no dual-layer panel.
+        asked: `front`, `back` or None.
+
+    Raises:
+        InputError: another layer than the twin's.
+    """
+    if of_twin is None or asked in (None, of_twin):
+        return of_twin or asked
+    raise InputError(
+        "layer",
+        received=asked,
+        expected=f"{of_twin}, which the twin was calibrated from",
+        remedy="leave the option out, or calibrate a twin of that layer",
+    )
 
 
 def _free(name: str, number: int, taken: set[str] | dict[str, Scene]) -> str:

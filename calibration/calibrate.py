@@ -155,6 +155,7 @@ def calibrate_twin(
         evidence=evidence,
         warnings=tuple(warnings),
         provenance=provenance or {},
+        layer=next((item.layer for item in acquisition.series if item.layer), None),
     )
     if advise and spectral is not None:
         tell("next measurement")

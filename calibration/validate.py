@@ -268,13 +268,14 @@ def validate_twin(
     squared_correlations = float(np.sum(rho**2)) / float(rho[_LAGS, _LAGS]) ** 2
     darks = _dark_means(acquisition)
     calibrated = {name for level in twin.levels for name in level.series}
-    same_session = sha256_of_file(acquisition.path) in str(twin.provenance.get("acquisition_sha256", "")).split("+")
+    hashes = str(twin.provenance.get("acquisition_sha256", "")).split("+")
+    known = [sha256_of_file(path) in hashes for path in acquisition.paths]
     rows, skipped = [], [*cut_off]
     for item in chosen:
         tell(item.name)
         setting = item.setting
         # an effect that came after calibration is not in the flats that calibrated
-        seen = same_session and item.name in calibrated
+        seen = known[item.session] and item.name in calibrated
         if setting is None or setting.tube_load_mAs is None:
             skipped.append(f"{item.name}: kV, exposure or tube load unknown")
             continue
@@ -338,7 +339,7 @@ def validate_twin(
                 extrapolated=predicted.extrapolated,
             )
         )
-    wedges = _wedge_rows(twin, acquisition, skipped, same_session=same_session)
+    wedges = _wedge_rows(twin, acquisition, skipped, known=known)
     if not rows and not wedges:
         raise InputError(
             f"acquisition {acquisition.path}",
@@ -362,8 +363,9 @@ def _dark_means(acquisition: AcquisitionFile) -> dict[float | None, NDArray[np.f
 
 
 def _wedge_rows(
-    twin: Twin, acquisition: AcquisitionFile, skipped: list[str], *, same_session: bool
+    twin: Twin, acquisition: AcquisitionFile, skipped: list[str], *, known: Sequence[bool]
 ) -> tuple[WedgeRow, ...]:
+    """known: of each session, whether the twin was calibrated from it."""
     if twin.spectral is None:
         return ()
     rows = []
@@ -376,9 +378,9 @@ def _wedge_rows(
     for entry in entries:
         if entry.skipped:
             skipped.append(entry.skipped)
-        role = next(item.role for item in acquisition.series if item.name == entry.series)
+        series = next(item for item in acquisition.series if item.name == entry.series)
+        seen = known[series.session] and series.role != "evaluation"
         for item in entry.transmissions:
-            seen = same_session and role != "evaluation"
             line = present_line(twin, after_calibration=not seen).twin
             predicted = predict_transmission(line, kV=item.kV, filters=item.filters, layers=item.layers)
             rows.append(

@@ -2,9 +2,11 @@
 
 from contextlib import ExitStack
 
+import h5py
 import numpy as np
 import pytest
 
+import raytwin as rt
 from raytwin.acquisition import Filter, Setting, open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.sessions import merge_sessions, one_layer, select_layer
@@ -213,8 +215,8 @@ PANEL = Instrument(
 )
 
 
-def test_a_layer_has_its_own_series_and_sees_what_lies_before_it(tmp_path):
-    path = tmp_path / "dual.h5"
+def dual_session(path):
+    """A dark and a flat of each layer of a panel; the back layer sees a quarter of the light."""
     rng = np.random.default_rng(1)
     with write_acquisition(path, PANEL) as writer:
         for layer, level in (("front", 4000.0), ("back", 900.0)):
@@ -225,6 +227,11 @@ def test_a_layer_has_its_own_series_and_sees_what_lies_before_it(tmp_path):
             writer.add_series(
                 f"flat_{layer}", kind="flat", frames=frames_of(level, rng=rng), setting=setting, layer=layer
             )
+    return path
+
+
+def test_a_layer_has_its_own_series_and_sees_what_lies_before_it(tmp_path):
+    path = dual_session(tmp_path / "dual.h5")
     with open_acquisition(path) as acquisition:
         back = select_layer(acquisition, "back")
         assert [item.name for item in back.series] == ["dark_back", "flat_back"]
@@ -254,3 +261,49 @@ def test_calibrate_takes_several_sessions(tmp_path, capsys):
     assert [level.kV for level in twin.levels] == [40.0, 60.0]
     assert len(twin.evidence["sessions"]) == 2
     assert len(str(twin.provenance["acquisition_sha256"]).split("+")) == 2
+
+
+def test_several_sessions_are_validated_as_one_and_each_knows_whether_it_calibrated(tmp_path):
+    paths = [session(tmp_path / "a.h5", seed=1), session(tmp_path / "b.h5", seed=2, powers=(8.0, 30.0))]
+    twin = rt.calibrate(paths[0], seed=0)
+    found = rt.validate(twin, tuple(paths))
+    assert [(row.series, row.used_in_calibration) for row in found.rows] == [
+        ("flat_5W", True), ("flat_10W", True), ("flat_20W", True), ("flat_8W", False), ("flat_30W", False),
+    ]  # fmt: skip
+    with ExitStack() as stack:
+        files = [stack.enter_context(open_acquisition(path)) for path in paths]
+        assert rt.validate(twin, files) == found
+
+
+def test_a_session_given_twice_is_refused(tmp_path, capsys):
+    path = session(tmp_path / "a.h5", seed=1)
+    copy = tmp_path / "copy.h5"
+    copy.write_bytes(path.read_bytes())
+    for second in (path, copy):
+        assert main(["calibrate", str(path), str(second), "-o", str(tmp_path / "t.h5")]) == 2
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert len(lines) == 1
+        assert "each session once" in lines[0]
+    assert not (tmp_path / "t.h5").exists()
+
+
+def test_a_twin_is_compared_with_the_layer_that_calibrated_it(tmp_path, capsys):
+    dual = dual_session(tmp_path / "dual.h5")
+    twin = tmp_path / "back.h5"
+    assert main(["calibrate", str(dual), "--layer", "back", "-o", str(twin)]) == 0
+    assert read_twin(twin).layer == "back"
+    assert rt.calibrate(session(tmp_path / "plain.h5", seed=1)).layer is None
+    assert [row.series for row in rt.validate(twin, dual).rows] == ["flat_back"]
+    capsys.readouterr()
+    assert main(["validate", str(twin), str(dual), "--layer", "front"]) == 2
+    assert "got front; expected back, which the twin was calibrated from" in capsys.readouterr().err
+    assert main(["diagnose", str(tmp_path / "plain.h5"), "--twin", str(twin), "-o", str(tmp_path / "d")]) == 2
+    assert "layer: got back; expected front" in capsys.readouterr().err
+
+
+def test_a_twin_file_without_a_layer_is_read(tmp_path):
+    twin = rt.calibrate(dual_session(tmp_path / "dual.h5"), layer="front")
+    twin.save(tmp_path / "t.h5")
+    with h5py.File(tmp_path / "t.h5", "r+") as file:
+        del file.attrs["layer"]
+    assert read_twin(tmp_path / "t.h5").layer is None

@@ -276,7 +276,10 @@ class SpectralPosterior(ByValue):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Twin(Result):
-    """A calibrated line; `effects` are those beyond the base model that it is known to have."""
+    """A calibrated line; `effects` are those beyond the base model that it is known to have.
+
+    layer: `front` or `back`, of a dual-layer panel whose series name theirs; else None.
+    """
 
     instrument: Instrument
     maps: DetectorMaps
@@ -288,6 +291,7 @@ class Twin(Result):
     warnings: tuple[str, ...]
     provenance: Mapping[str, Any] = field(default_factory=dict)
     effects: tuple[AppliedEffect, ...] = ()
+    layer: str | None = None
 
     def level_at(self, setting: Setting) -> Level | None:
         """The measured level of this kV and these filters (same layers in any order), or None."""

@@ -102,6 +102,8 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
             file.attrs["output_known"] = twin.output_known
             _put_spectral(file, twin.spectral)
             return
+        if twin.layer is not None:
+            file.attrs["layer"] = twin.layer
         if twin.effects:
             in_order(twin.effects)  # refuses what could not be read back
             file.attrs["effects"] = json.dumps(
@@ -335,6 +337,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
         warnings=_texts(file.attrs["warnings"]),
         provenance=_object(file.attrs["provenance"]),
         effects=_effects_from_text(_text(file.attrs["effects"])) if "effects" in file.attrs else (),
+        layer=_text(file.attrs["layer"]) if "layer" in file.attrs else None,
     )
 
 

@@ -139,6 +139,27 @@ def acquisition_sha256(given: "AcquisitionFile | PathLike") -> str:
     return sha256_of_file(given if isinstance(given, str | os.PathLike) else given.path)
 
 
+def distinct_sha256(given: "Sequence[AcquisitionFile | PathLike]") -> list[str]:
+    """SHA-256 of each acquisition's file.
+
+    Raises:
+        InputError: the same contents twice, which would count as two measurements.
+    """
+    found: dict[str, AcquisitionFile | PathLike] = {}
+    for item in given:
+        digest = acquisition_sha256(item)
+        if digest in found:
+            first, again = (str(getattr(one, "path", one)) for one in (found[digest], item))
+            raise InputError(
+                "acquisition",
+                received=f"{again}, the same file as {first}" if again != first else f"{first} twice",
+                expected="each session once",
+                remedy="leave the second one out",
+            )
+        found[digest] = item
+    return list(found)
+
+
 @contextmanager
 def dataset_of(given: "Dataset | PathLike") -> "Iterator[Dataset]":
     """A dataset from its file, or an open one, which stays open.

@@ -12,10 +12,9 @@ from ..results import Result, Table, axes_or_new, frame, plain
 from ._folder import check_effects, written_folder
 from ._given import (
     PathLike,
-    acquisition_sha256,
     as_twin,
+    distinct_sha256,
     generator_of,
-    listed,
     opened,
     seed_number,
     twin_sha256,
@@ -211,7 +210,7 @@ def diagnose(
         acquisition: a file or an open one, anything from darks and two flats to the full protocol.
         twin: calibrated before, whose effects are part of what is expected; None: from this session's own series.
         also: what was measured later on the same line; calibrates nothing.
-        layer: `front` or `back` of a dual-layer panel; None: front.
+        layer: `front` or `back` of a dual-layer panel; None: the twin's, front without one.
         without: effects to leave out of the catalogue.
         plan_only: say which effects these series could distinguish, whatever the frames show.
         output: folder for diagnosis.json, report.html and twin.h5; None: nothing is written.
@@ -235,7 +234,7 @@ def diagnose(
         True
     """
     from .. import __version__
-    from ..acquisition.sessions import continued_session
+    from ..acquisition.sessions import continued_session, layer_for
     from ..diagnosis.advice.plan_session import plan_session
     from ..diagnosis.diagnose_session import diagnose as diagnose_session
     from ..generator.effects import EFFECTS
@@ -255,16 +254,17 @@ def diagnose(
             None if task is None else _task(task, seed=whole_seed(seed) if number is None else number, device=device)
         )
         with opened([acquisition, *also]) as files:
-            session = continued_session(files, layer=layer)
+            hashes = distinct_sha256(files)
+            session = continued_session(files, layer=layer_for(None if known is None else known.layer, layer))
             if plan_only:
                 plan = plan_session(session, twin=known, rng=rng, without=without, progress=telling.stage)
                 if folder is not None:
                     write_json(folder / "plan.json", plan.to_dict())
                 return plan
             found = diagnose_session(session, twin=known, rng=rng, without=without, progress=telling.stage)
-        later = {"also_sha256": [acquisition_sha256(item) for item in also]} if also else {}
+        later = {"also_sha256": hashes[1:]} if also else {}
         inputs = {
-            "acquisition_sha256": acquisition_sha256(listed(acquisition)[0]),
+            "acquisition_sha256": hashes[0],
             **later,
             "twin_sha256": None if twin is None else twin_sha256(twin),
             "raytwin_version": __version__,

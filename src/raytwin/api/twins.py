@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from ._given import PathLike, acquisition_sha256, as_any_twin, as_twin, generator_of, listed, opened, seed_number
+from ._given import PathLike, as_any_twin, as_twin, distinct_sha256, generator_of, opened, seed_number
 from ._progress import Progress, Telling
 
 if TYPE_CHECKING:
@@ -142,6 +142,7 @@ def calibrate(
             "instrument", received="an acquisition too", expected="one statement of the tube: the acquisition's"
         )
     with opened(acquisition) as files, Telling(progress) as telling:
+        hashes = distinct_sha256(files)
         output, absorbed = _tables(output_table, transmission, files[0].instrument, has_detector=True)
         return calibrate_twin(
             one_layer(merge_sessions(files), layer),
@@ -151,10 +152,7 @@ def calibrate(
             progress=telling.stage,
             output_table=output,
             transmission_table=absorbed,
-            provenance={
-                "acquisition_sha256": "+".join(acquisition_sha256(item) for item in listed(acquisition)),
-                **provenance,
-            },
+            provenance={"acquisition_sha256": "+".join(hashes), **provenance},
         )
 
 
@@ -217,7 +215,7 @@ def validate(
     Args:
         twin: a twin, its file, or a shipped calibration's name.
         acquisition: a file, an open one, or several sessions of one line.
-        layer: `front` or `back` of a dual-layer panel; None: front.
+        layer: `front` or `back` of a dual-layer panel; None: the twin's, front without one.
         leave_one_out: also each level of the twin predicted from its other levels.
         seed: a whole number or a generator, of the fits that leave a level out.
         progress: True for a bar, or a function of (stage, done, total).
@@ -233,14 +231,16 @@ def validate(
         >>> bool(found.to_dataframe()["inside_mean"].all())
         True
     """
-    from ..acquisition.sessions import merge_sessions, one_layer
+    from ..acquisition.sessions import layer_for, merge_sessions, one_layer
     from ..calibration.validate import leave_one_out as predict_left_out
     from ..calibration.validate import validate_twin
 
     known = as_twin(twin)
     with Telling(progress, unit="level") as telling:
         with opened(acquisition) as files:
-            found = validate_twin(known, one_layer(merge_sessions(files), layer), progress=telling.stage)
+            distinct_sha256(files)
+            session = one_layer(merge_sessions(files), layer_for(known.layer, layer))
+            found = validate_twin(known, session, progress=telling.stage)
         if leave_one_out:
             telling.begin("leaving out", len(known.levels))
             rows = predict_left_out(known, rng=generator_of(seed), progress=lambda name: telling.advance())

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--layer",
         choices=("front", "back"),
-        help="of a dual-layer panel, by the series' attribute `layer` (default: front)",
+        help="of a dual-layer panel, by the series' attribute `layer` (default: the twin's, front without one)",
     )
     parser.add_argument("-o", "--output", metavar="DIR", type=Path, required=True, help="folder of the answer")
     parser.add_argument(

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--layer",
         choices=("front", "back"),
-        help="of a dual-layer panel, by the series' attribute `layer` (default: front)",
+        help="of a dual-layer panel, by the series' attribute `layer` (default: the twin's, front without one)",
     )
     parser.add_argument(
         "--leave-one-out", action="store_true", help="predict each level of the twin from its other levels"

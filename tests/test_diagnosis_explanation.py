@@ -11,22 +11,21 @@ from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, title_of
 from raytwin.diagnosis.judgement.answer import Cause, Diagnosis, Place
 from raytwin.diagnosis.judgement.held_out import Gap
 from raytwin.diagnosis.judgement.judgement import verdict_of
-from raytwin.diagnosis.report.explanation import location_text, paragraph
-from raytwin.diagnosis.report.report import next_steps
+from raytwin.diagnosis.report.explanation import location_text, paragraph, share_text
+from raytwin.diagnosis.report.report import headline, lead_text, next_steps
 
 
 def place(axis, series, z, *, statistic="mean frame", location=""):
     return Place(axis=axis, series=series, statistic=statistic, location=location, unit="1", z=z)
 
 
-def cause(effect, probability, strength, *, unit="%", sign=1.0):
+def cause(effect, probability, strength, *, unit="%"):
     return Cause(
         effect=effect,
         probability=probability,
         strength=strength,
         unit=unit,
         parameters={},
-        sign=sign,
         since="always",
         shrinks_by=(0.8, 0.7, 0.9),
     )
@@ -111,7 +110,7 @@ def test_an_explanation_states_strength_interval_probability_and_what_is_left():
     beyond = Gap(before=3.0, after=0.78, floor=0.8, shrinks_by=(1.01, 0.97, 1.04))
     text = paragraph(diagnosis("explained", causes=(found,), named=("object_scatter",), gap=beyond))
     assert "falls to 0.78 once that is added, by 100 % (97 to 100) of what is above noise" in text
-    lower = cause("kv_error", 0.9, (2.0, 1.5, 2.5), sign=-1.0)
+    lower = cause("kv_error", 0.9, (-2.0, -2.5, -1.5))
     assert "-2.00 % (-2.50 to -1.50)" in paragraph(diagnosis("explained", causes=(lower,), named=("kv_error",)))
 
 
@@ -122,6 +121,29 @@ def test_what_leaves_most_of_the_gap_is_no_explanation():
     assert "Of the catalogue it is most like: noise common to rows" in text
     assert "does not fall (8.30) once that is added." in text
     assert "explained by" not in text
+    assert "What is above noise grows by 14 % (-69 to 77). The twin with it added is no better" in text
+    found = diagnosis("explained_in_part", causes=(found,), named=("row_noise",), gap=wider, added=("row_noise",))
+    steps = [step["text"] for step in next_steps(found)]
+    assert steps[0].startswith("Keep the twin as it was")
+    assert not any(text.startswith("Use the improved twin") for text in steps)
+    assert headline(found).endswith("most like it, but the gap does not fall")
+    assert lead_text(found).count("no better") == 1
+    assert share_text(wider.shrinks_by) == "grows by 14 %"
+
+
+def test_an_effect_is_observed_in_its_probes_where_the_gap_over_all_was_at_its_floor():
+    found = cause("focal_spot", 0.99, (0.7, 0.53, 0.9), unit="mm")
+    floor = Gap(before=0.71, after=0.70, floor=0.73, shrinks_by=None)
+    seen = diagnosis("explained", causes=(found,), named=("focal_spot",), gap=floor, added=("focal_spot",))
+    text = paragraph(seen)
+    assert "explained" not in text
+    assert "Observed there: focal spot larger than assumed, 0.700 mm (0.530 to 0.900)" in text
+    assert "over all probes at its floor of 0.73 already, and 0.70 once that is added." in text
+    assert "the gap was at its floor of 0.73 already: 0.71, and 0.70 with what was found" in lead_text(seen)
+    assert next_steps(seen)[0]["text"].startswith("Use the improved twin")
+    # what was no gap and is one with the effect added does not fall
+    worse = diagnosis("explained", causes=(found,), named=("focal_spot",), gap=replace(floor, after=1.4), added=("x",))
+    assert next_steps(worse)[0]["text"].startswith("Keep the twin as it was")
 
 
 def test_a_session_whose_numbers_stop_early_has_a_gap_whatever_the_rest_says():

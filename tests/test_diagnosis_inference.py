@@ -27,7 +27,7 @@ from raytwin.diagnosis.inference.search import Slopes, _in_turn, _within, search
 from raytwin.diagnosis.inference.seen import Blocks, FitTarget
 from raytwin.diagnosis.inference.steady import Steady
 from raytwin.diagnosis.inference.unknown import Families, fit_extra_variance
-from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _strained, _with_curves
+from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _causes, _strained, _with_curves, verdict_of
 from raytwin.diagnosis.judgement.strengths import _outright, applied_at_best
 from raytwin.diagnosis.model.changes import Variant
 from raytwin.diagnosis.model.curves import Curve
@@ -372,6 +372,22 @@ def test_how_well_a_strength_is_known_is_what_its_interval_says():
     off = replace(exact, levels={"veiling_glare": 0.4})
     found = applied_at_best(Bare(conditions={}, families=halves), off, "veiling_glare")
     assert found.strength_sd == pytest.approx(0.4 / math.sqrt(2.0), rel=1e-9)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_cause_has_the_sign_of_its_variant(sign):
+    named = Hypothesis(
+        effects=("kv_error",),
+        probability=1.0,
+        log_evidence=0.0,
+        strengths={"kv_error": (2.0, 1.5, 2.5)},
+        variants={"kv_error": one_node("kv_error", np.ones(PROBES), sign=sign)},
+        levels={"kv_error": 0.0},
+    )
+    (cause,) = _causes(Bare(conditions={}), verdict_of((named,)), {}, ())
+    value, low, high = cause.strength
+    assert value == 2.0 * sign
+    assert low < value < high
 
 
 def test_each_of_the_leading_effects_is_weighed_with_its_best_companion():

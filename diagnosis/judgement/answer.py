@@ -29,7 +29,7 @@ _PLOTTED = 12  # hypotheses, the most probable
 class Cause:
     """An effect, how probable it is, its strength and inner parameters, how far the gap shrinks with it, and what its law leaves.
 
-    level: by how much of itself its law seems to be off; series: names of those in which it acts, empty: all since its onset.
+    strength: value, low, high with their sign; level: by how much of itself its law seems to be off; series: names of those in which it acts, empty: all since its onset.
     """
 
     effect: str
@@ -37,7 +37,6 @@ class Cause:
     strength: tuple[float, float, float]
     unit: str
     parameters: Mapping[str, float]
-    sign: float
     since: str
     shrinks_by: tuple[float, float, float] | None
     level: float = 0.0
@@ -239,17 +238,13 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any] | None =
     def interval(value: tuple[float, float, float] | None) -> dict[str, float] | None:
         return None if value is None else {"value": value[0], "low": value[1], "high": value[2]}
 
+    def strength(cause: Cause) -> dict[str, Any]:
+        return {**(interval(cause.strength) or {}), "unit": cause.unit}
+
     def parameters(cause: Cause) -> dict[str, Any]:
         effect = EFFECTS[cause.effect]
         units = {item.name: item.unit for item in effect.parameters}
-        values = {
-            "strength": {
-                "value": cause.sign * cause.strength[0],
-                "low": min(cause.sign * cause.strength[1], cause.sign * cause.strength[2]),
-                "high": max(cause.sign * cause.strength[1], cause.sign * cause.strength[2]),
-                "unit": cause.unit,
-            }
-        }
+        values = {"strength": strength(cause)}
         for name, value in cause.parameters.items():
             values[name] = {"value": value, "low": value, "high": value, "unit": units.get(name, "")}
         return values
@@ -263,7 +258,7 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any] | None =
             {
                 "effect": cause.effect,
                 "probability": cause.probability,
-                "strength": {**(interval(cause.strength) or {}), "unit": cause.unit},
+                "strength": strength(cause),
                 "parameters": parameters(cause),
                 "since": cause.since,
                 "onset": cause.onset if isinstance(cause.onset, str) else list(cause.onset),

@@ -28,6 +28,16 @@ class Gap:
     floor: float
     shrinks_by: tuple[float, float, float] | None
 
+    @property
+    def at_floor(self) -> bool:
+        """Whether there was no gap above the floor to remove, and there is none with what was found added."""
+        return self.shrinks_by is None and self.after <= max(self.before, self.floor)
+
+    @property
+    def falls(self) -> bool:
+        """Whether the twin is nearer with what was found added."""
+        return self.after < self.before
+
 
 def folds_of(problem: Problem) -> NDArray[np.intp]:
     """Fold 0 or 1 of each series: alternating in time within each kind, sort of object and tube voltage.

@@ -306,10 +306,9 @@ def _causes(
             Cause(
                 effect=effect,
                 probability=min(marginal[effect], 1.0),
-                strength=strength_of(problem, best, effect),
+                strength=_signed(variant.sign, strength_of(problem, best, effect)),
                 unit=EFFECTS[effect].strength.unit,
                 parameters=dict(variant.parameters),
-                sign=variant.sign,
                 since=variant.since,
                 series=variant.series,
                 shrinks_by=shares.get(effect),
@@ -318,6 +317,12 @@ def _causes(
             )
         )
     return tuple(sorted(causes, key=lambda item: -item.probability))
+
+
+def _signed(sign: float, strength: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Value, low and high of a strength with the sign of its variant."""
+    value, low, high = (sign * one for one in strength)
+    return value, min(low, high), max(low, high)
 
 
 def _places(problem: Problem, nuisances: LocalNuisances) -> tuple[Place, ...]:

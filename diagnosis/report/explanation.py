@@ -45,9 +45,7 @@ def _percent(value: tuple[float, float, float]) -> str:
 def strength_text(cause: Cause) -> str:
     """Strength with its 95 % interval and unit."""
     value, low, high = cause.strength
-    digits = min(max(0, 2 - math.floor(math.log10(max(value, 1e-9)))), 4)
-    if cause.sign < 0:
-        value, low, high = -value, -high, -low
+    digits = min(max(0, 2 - math.floor(math.log10(max(abs(value), 1e-9)))), 4)
     return f"{value:.{digits}f} {cause.unit} ({low:.{digits}f} to {high:.{digits}f})"
 
 
@@ -175,15 +173,17 @@ def verdict_text(diagnosis: Diagnosis) -> str:
         for cause in diagnosis.leading
     )
     share = None if gap.shrinks_by is None else gap.shrinks_by[0]
-    found = "It is explained by" if share is None or share > _MOSTLY else "Of the catalogue it is most like"
-    text = f"{where} {found}: {named}. {figures}"
-    if gap.shrinks_by is not None:
-        value, low, high = (min(one, 1.0) for one in gap.shrinks_by)
-        share_text = f", by {_percent((value, low, high))} of what is above noise" if gap.after < gap.before else ""
-        text += f" and {fall_text(gap)} once that is added{share_text}."
+    if gap.at_floor:
+        found = "Observed there"
+    elif gap.falls and (share is None or share > _MOSTLY):
+        found = "It is explained by"
     else:
-        text += f" and {gap.after:.2f} after; it is too close to noise for a share to mean anything."
-    return text + rest_text(diagnosis)
+        found = "Of the catalogue it is most like"
+    text = f"{where} {found}: {named}. {figures}{',' if gap.at_floor else ' and'} {fall_text(gap)} once that is added"
+    if gap.falls and gap.shrinks_by is not None:
+        value, low, high = (min(one, 1.0) for one in gap.shrinks_by)
+        text += f", by {_percent((value, low, high))} of what is above noise"
+    return f"{text}.{no_better_text(gap)}{rest_text(diagnosis)}"
 
 
 def findings_title(diagnosis: Diagnosis) -> str:
@@ -199,7 +199,28 @@ def rivals(diagnosis: Diagnosis) -> list[tuple[str, float]]:
 
 def fall_text(gap: Gap) -> str:
     """What becomes of the gap once what was found is added: a verb and the figure."""
-    return f"falls to {gap.after:.2f}" if gap.after < gap.before else f"does not fall ({gap.after:.2f})"
+    if gap.at_floor:
+        return f"over all probes at its floor of {gap.floor:.2f} already, and {gap.after:.2f}"
+    return f"falls to {gap.after:.2f}" if gap.falls else f"does not fall ({gap.after:.2f})"
+
+
+def no_better_text(gap: Gap) -> str:
+    """That the improved twin is none, where the gap does not fall; empty elsewhere."""
+    if gap.falls or gap.at_floor:
+        return ""
+    grown = ""
+    if gap.shrinks_by is not None:
+        value, low, high = gap.shrinks_by
+        grown = f" What is above noise grows by {_percent((-value, -high, -low))}."
+    return f"{grown} The twin with it added is no better than the twin without."
+
+
+def share_text(share: tuple[float, float, float] | None) -> str:
+    """Share of the gap that an effect removes, in words where it removes none; empty where there was no gap to remove."""
+    if share is None:
+        return ""
+    value = 100.0 * min(share[0], 1.0)
+    return f"{value:.0f} %" if value >= 0.0 else f"grows by {-value:.0f} %"
 
 
 def rest_text(diagnosis: Diagnosis) -> str:

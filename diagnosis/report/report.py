@@ -21,8 +21,10 @@ from .explanation import (
     fall_text,
     findings_title,
     location_text,
+    no_better_text,
     rest_text,
     rivals,
+    share_text,
     strained_text,
     strength_text,
     verdict_text,
@@ -147,6 +149,8 @@ def _headline_of_verdict(diagnosis: Diagnosis) -> str:
         names = [title for title, _ in rivals(diagnosis)[:3]]
         return _sentence(f"{' or '.join(names)}: these data cannot distinguish them")
     named = _sentence(" and ".join(f"{title_of(cause.effect)}, {strength_text(cause)}" for cause in diagnosis.leading))
+    if not (diagnosis.gap.falls or diagnosis.gap.at_floor):
+        return f"{named}: most like it, but the gap does not fall"
     return f"{named}: its law leaves a misfit" if diagnosis.verdict == "explained_in_part" else named
 
 
@@ -166,8 +170,13 @@ def lead_text(diagnosis: Diagnosis) -> str:
         return verdict_text(diagnosis)
     place = diagnosis.where[0]
     seen = f"The gap is clearest in the {axis_text(place.axis)} of {place.series}"
+    if gap.at_floor:
+        return (
+            f"{seen}. Over all probes of series that the fit did not use, the gap was at its floor of {gap.floor:.2f} already:"
+            f" {gap.before:.2f}, and {gap.after:.2f} with what was found added to the twin.{rest_text(diagnosis)}"
+        )
     ends = f"the gap on series that the fit did not use, {gap.before:.2f} (1: noise alone), {fall_text(gap)}"
-    return f"{seen}. With what was found added to the twin, {ends}.{rest_text(diagnosis)}"
+    return f"{seen}. With what was found added to the twin, {ends}.{no_better_text(gap)}{rest_text(diagnosis)}"
 
 
 _LABELS = (
@@ -216,6 +225,16 @@ def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
         ]
     if diagnosis.verdict == "ambiguous":
         return [*measured, *_confirmed_by(diagnosis.causes[:3])]
+    if not (diagnosis.gap.falls or diagnosis.gap.at_floor):
+        return [
+            step(
+                "Keep the twin as it was: the gap on series that the fit did not use does not fall with the improved twin beside"
+                " this page."
+            ),
+            *measured,
+            step("Look at the maps and probes below: what is left says where the law is off."),
+            *_confirmed_by(diagnosis.leading),
+        ]
     use = step(
         "Use the improved twin that lies beside this page; every command takes it.",
         "raytwin predict twin.h5 --kv 60 --power-w 40 --exposure-ms 20",
@@ -258,9 +277,10 @@ def _key_figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
         found.append({"value": f"{gap.before:.2f}", "text": "gap (1: noise alone)"})
     if diagnosis.added and gap.shrinks_by is not None:
         value, low, high = (100.0 * min(one, 1.0) for one in gap.shrinks_by)
-        found.append(
-            {"value": f"{value:.0f} %", "text": f"of the gap above noise is removed (95 %: {low:.0f} to {high:.0f} %)"}
-        )
+        text = f"of the gap above noise is removed (95 %: {low:.0f} to {high:.0f} %)"
+        if not gap.falls:
+            value, text = -value, f"more gap above noise, none is removed (95 %: {-high:.0f} to {-low:.0f} %)"
+        found.append({"value": f"{value:.0f} %", "text": text})
     return found
 
 
@@ -273,7 +293,7 @@ def _causes(diagnosis: Diagnosis) -> SortedTable:
             strength_text(cause),
             ", ".join(f"{name} {value:.3g}" for name, value in cause.parameters.items()),
             f"in {', '.join(cause.series)} only" if cause.series else _SINCE.get(cause.since, "always there"),
-            "" if cause.shrinks_by is None else f"{100.0 * min(cause.shrinks_by[0], 1.0):.0f} %",
+            share_text(cause.shrinks_by),
             f"{100.0 * cause.level:.0f} %",
         )
         for cause in diagnosis.causes

@@ -14,6 +14,7 @@ from .judgement.answer import Diagnosis, in_pixels
 from .judgement.judgement import judge
 from .problem.assemble import problem_of
 from .session.binning import lost_by_binning
+from .session.inapplicable import inapplicable
 from .session.preparation import calibrated_twin, findings_left, mislabelled, prepare_session
 
 
@@ -58,7 +59,8 @@ def _diagnosed(
         unseen = lost_by_binning() if session.factor > 1 else {}
         left = session.findings
         try:
-            problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
+            passed_over = (*without, *unseen, *inapplicable(session.twin.instrument))
+            problem = problem_of(session, session.twin, without=passed_over, progress=progress)
             result = judge(problem, session.twin, rng=rng, progress=progress)
         except InputError as error:
             if not left and session.contradicted:

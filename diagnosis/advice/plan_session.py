@@ -14,6 +14,7 @@ from ...generator.line.twin import Twin
 from ...results import Result, Table, axes_or_new, frame, plain
 from ..problem.assemble import problem_of
 from ..session.binning import lost_by_binning
+from ..session.inapplicable import inapplicable
 from ..session.preparation import prepare_session
 from .plan import Distinguishability, distinguishability
 
@@ -113,7 +114,8 @@ def plan_session(
     with threadpool_limits(limits=1, user_api="blas"):
         session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
         unseen = lost_by_binning() if session.factor > 1 else {}
-        problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
+        passed_over = (*without, *unseen, *inapplicable(session.twin.instrument))
+        problem = problem_of(session, session.twin, without=passed_over, progress=progress)
         found = distinguishability(problem)
     shares = [EFFECTS[effect].strength.pixels_per_bin(session.factor) for effect in found.effects]
     return SessionPlan(

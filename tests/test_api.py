@@ -423,6 +423,10 @@ def closed():
         (lambda: rt.calibrate([]), "acquisition: got none"),
         (lambda: rt.contrast(product="water:1", foreign_object="Al:1", low=LOW, high=HIGH, kV_low=[40]), "1 axes"),
         (lambda: rt.contrast(product="water:1", foreign_object="Al:1", low=LOW, high=HIGH, swan=1), "swan"),
+        (
+            lambda: rt.contrast(product="water:1", foreign_object="Al:1", low=LOW, high=HIGH, object_pixels=10.5),
+            "object pixels: got 10.5; expected a whole number from 1 to",
+        ),
         (lambda: rt.fit_pod(3), "table: got int"),
         (lambda: rt.lab_session("x.h5", protocol="calibration", sizes=3), "sizes"),
         (lambda: rt.lab_session("x.h5", protocol="calibration", size="16"), "size: got '16'; expected N or (rows"),
@@ -584,3 +588,8 @@ def test_raytwin_alone_shows_the_way_and_a_mistyped_command_its_neighbour(capsys
     assert main(["calibrat", "x.h5"]) == 2
     told = capsys.readouterr()
     assert told.out == "" and "did you mean `raytwin calibrate`?" in told.err and len(told.err.splitlines()) == 1
+
+
+def test_an_array_without_axes_is_a_number(inside):
+    words = {"power_W": 30, "exposure_ms": 20}
+    assert rt.predict("twin.h5", kV=np.array(60.0), **words) == rt.predict("twin.h5", kV=60.0, **words)

@@ -29,7 +29,8 @@ _PLOTTED = 12  # hypotheses, the most probable
 class Cause:
     """An effect, how probable it is, its strength and inner parameters, how far the gap shrinks with it, and what its law leaves.
 
-    strength: value, low, high with their sign; level: by how much of itself its law seems to be off; series: names of those in which it acts, empty: all since its onset.
+    strength: value, low, high, signed; level: by how much of itself its law seems to be off; series: names of those in which it
+    acts, empty: all since its onset.
     """
 
     effect: str

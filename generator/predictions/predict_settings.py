@@ -79,7 +79,7 @@ def settings_from_words(words: Mapping[str, Any]) -> tuple[Setting, ...] | Setti
     lists = {
         name: list(value)
         for name, value in words.items()
-        if not isinstance(value, str | Filter) and hasattr(value, "__iter__")
+        if not isinstance(value, str | Filter) and hasattr(value, "__iter__") and getattr(value, "ndim", 1) > 0
     }
     if not lists:
         return as_setting(words)

@@ -266,12 +266,15 @@ def _exposed(twin: Twin, kV: float, filters: tuple[Filter, ...], rate_DN_per_mAs
     pitch = twin.instrument.pixel_mm or 1.0
     rate = rate_DN_per_mAs * (1000.0 / distance) ** 2 * pitch**2
     per_ms = rate * power_W / kV / 1000.0
-    exposure_ms = float(np.clip(np.median(signals) / per_ms, min(exposures), _LONGEST * max(exposures)))
+    # the belt fixes how long lines are exposed
+    longest_ms = max(exposures) * (1.0 if twin.instrument.detector in ("line", "tdi") else _LONGEST)
+    exposure_ms = float(np.clip(np.median(signals) / per_ms, min(exposures), longest_ms))
     if per_ms * exposure_ms < _DIMMEST * min(signals):
         return None
     # a bright beam at the shortest exposure takes less power
     power_W *= min(1.0, max(signals) / (per_ms * exposure_ms))
-    return Setting(kV=kV, power_W=float(f"{power_W:.3g}"), exposure_ms=float(f"{exposure_ms:.2g}"), filters=filters)
+    rounded_ms = float(np.clip(float(f"{exposure_ms:.2g}"), min(exposures), longest_ms))
+    return Setting(kV=kV, power_W=float(f"{power_W:.3g}"), exposure_ms=rounded_ms, filters=filters)
 
 
 def _sentence(kind: str, setting: Setting, steps: tuple[Filter, ...], shrinks_to: float, dose_shrinks_to: float) -> str:

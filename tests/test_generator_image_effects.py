@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from raytwin.acquisition.dataset_io import DatasetRow, read_dataset, write_dataset
-from raytwin.acquisition.setting import setting_from_text
+from raytwin.acquisition.setting import Setting, setting_from_text
 from raytwin.cli import main
 from raytwin.errors import InputError
+from raytwin.generator.datasets.belt_motion import twin_on_belt
 from raytwin.generator.datasets.fresh import FreshReferences
 from raytwin.generator.datasets.generate import ChannelModel, ReferenceImages, generate_dataset
 from raytwin.generator.datasets.generate_described import DescribedScenes
@@ -184,6 +185,14 @@ def fillets(tmp_path_factory):
     path = tmp_path_factory.mktemp("description") / "fillets.toml"
     path.write_text(FILLET, encoding="utf-8")
     return read_description(path)
+
+
+@pytest.mark.parametrize(("detector", "told"), [("line", False), ("tdi", False), ("area", True), (None, True)])
+def test_the_direction_of_the_belt_is_in_doubt_on_panels_alone(make_model_twin, detector, told):
+    twin = make_model_twin(SHAPE, pixel_mm=0.15, source_object_mm=900.0, source_detector_mm=1059.0, detector=detector)
+    moving = Setting(kV=60.0, exposure_ms=5.0, power_W=10.0, belt_speed_mm_s=100.0)
+    _, lines = twin_on_belt(twin, (moving, moving))
+    assert any("belt_axis is not declared" in line for line in lines) == told
 
 
 def test_the_way_through_the_effects_shows_the_same_picture_when_they_do_nothing(make_model_twin, fillets):

@@ -60,7 +60,8 @@ def twin_on_belt(twin: Twin, pair: tuple[Setting, Setting]) -> tuple[Twin, tuple
     own = [item for item in twin.effects if item.id == MOTION_BLUR.id]
     if own:
         told.append("the twin's own motion blur gives way to that of the setting's belt speed")
-    if twin.instrument.belt_axis is None:
+    # rows of a line camera are lines taken one after another
+    if twin.instrument.belt_axis is None and twin.instrument.detector not in ("line", "tdi"):
         told.append("the belt is taken to move along the rows' index: the twin's belt_axis is not declared")
     motion = AppliedEffect(id=MOTION_BLUR.id, parameters={"strength": strength}, since="calibration")
     rest = tuple(item for item in twin.effects if item.id != MOTION_BLUR.id)

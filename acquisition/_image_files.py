@@ -192,8 +192,17 @@ def _quiet_about_harmless_faults() -> Iterator[None]:
             logger.callHandlers(record)
 
 
-def _fits_planes(path: Path) -> Iterator[NDArray[Any]]:
-    """The first HDU that holds an image, (row, column) or (n, row, column); FITS stores the row at the bottom first."""
+def images_left(path: Path) -> int:
+    """How many images a file holds behind those that `iter_images` yields: further HDUs of FITS."""
+    if path.suffix.lower() not in FITS_ENDINGS:
+        return 0
+    with _fits_images(path) as found:
+        return len(found) - 1
+
+
+@contextmanager
+def _fits_images(path: Path) -> Iterator[list[Any]]:
+    """The HDUs that hold images, one at least, while the file is open."""
     try:
         from astropy.io import fits
     except ImportError:
@@ -203,13 +212,19 @@ def _fits_planes(path: Path) -> Iterator[NDArray[Any]]:
             # a file that was cut off is read with a warning and zeros in place of what is missing
             warnings.simplefilter("error")
             with path.open("rb") as stream, fits.open(stream, memmap=False) as file:
-                found = next((hdu for hdu in file if hdu.is_image and hdu.header.get("NAXIS", 0) >= 2), None)
-                if found is None:
+                found = [hdu for hdu in file if hdu.is_image and hdu.header.get("NAXIS", 0) >= 2]
+                if not found:
                     raise ValueError("no image in it")
-                # BZERO makes whole numbers of what FITS has no type for: unsigned ones
-                values = np.asarray(found.data)
+                yield found
     except Exception as error:  # astropy raises whatever it likes at damaged files
         raise damaged(path, error) from None
+
+
+def _fits_planes(path: Path) -> Iterator[NDArray[Any]]:
+    """The first HDU that holds an image, (row, column) or (n, row, column); FITS stores the row at the bottom first."""
+    with _fits_images(path) as found:
+        # BZERO makes whole numbers of what FITS has no type for: unsigned ones
+        values = np.asarray(found[0].data)
     values = values.astype(values.dtype.newbyteorder("="), copy=False)
     if values.ndim == 2:
         values = values[None]

@@ -61,11 +61,13 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import FileFormatError, InputError
+from ..results import counted
 from ._image_files import (
     IMAGE_ENDINGS,
     TIFF_ENDINGS,
     RawLayout,
     frame_dtype,
+    images_left,
     iter_images,
     number_in_cell,
     read_image,
@@ -360,6 +362,11 @@ def _write_series(
     shape: tuple[int, int] | None = None
     for path in files:
         used.add(path)
+        if left := images_left(path):
+            notes.append(
+                f"series {plan.name}: {counted(left, 'image')} behind the first of {path.name} not taken; a stack of three axes"
+                " in one HDU is taken whole"
+            )
         for image in iter_images(path, raw=raw):
             if series is None:
                 shape = (image.shape[0], image.shape[1])

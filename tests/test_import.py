@@ -955,6 +955,11 @@ def test_fits_images_come_in_as_they_are_stored_unsigned_and_in_stacks(tmp_path)
     fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(frames[0])]).writeto(tmp_path / "extension.fit")
     np.testing.assert_array_equal(list(iter_images(tmp_path / "stack.fits")), frames)
     np.testing.assert_array_equal(read_image(tmp_path / "extension.fit"), frames[0])
+    extensions = [fits.PrimaryHDU(), *(fits.ImageHDU(frame) for frame in (frames[0], frames[1], frames[1]))]
+    fits.HDUList(extensions).writeto(tmp_path / "several.fits")
+    (tmp_path / "raytwin.toml").write_text('[[series]]\nkind = "dark"\nfiles = "several.fits"\nexposure_ms = 20\n')
+    report = import_images(tmp_path, tmp_path / "out.h5")
+    assert any("2 images behind the first of several.fits not taken" in note for note in report.notes)
     whole = (tmp_path / "stack.fits").read_bytes()
     (tmp_path / "cut.fits").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(FileFormatError, match=r"cut\.fits"):

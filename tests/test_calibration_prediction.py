@@ -174,6 +174,13 @@ def test_advice_says_how_far_voltages_carry_and_what_each_kind_of_measurement_br
     assert reading["dose_shrinks_to"] < 0.75 < third["dose_shrinks_to"]
 
 
+@pytest.mark.parametrize("detector", ["line", "tdi"])
+def test_flats_of_a_line_camera_are_proposed_at_exposures_that_its_belt_allowed(model, truth, detector):
+    twin = twin_of(model, truth, [(40.0, "Cu:0.05"), (90.0, "Cu:0.05")])
+    ranked = rank_measurements(replace(twin, instrument=replace(INSTRUMENT, detector=detector)))
+    assert {item.setting.exposure_ms for item in ranked if item.kind == "flats"} == {20.0}
+
+
 def test_one_kV_is_told_to_measure_another(model, truth):
     ranked = rank_measurements(twin_of(model, truth, [(90.0, "Cu:0.05")]))
     best = next(item for item in ranked if item.kind == "flats")

@@ -10,7 +10,9 @@ import pytest
 import tifffile
 from scipy.ndimage import gaussian_filter, median_filter
 
+import raytwin as rt
 from raytwin.acquisition import open_acquisition
+from raytwin.acquisition.images import import_images
 from raytwin.cli import main
 from raytwin.diagnosis.session.origin import made_of
 from raytwin.generator.twins.twin_io import read_twin
@@ -82,6 +84,13 @@ def test_what_the_frames_cannot_tell_is_null_or_wide_and_said(answer):
     assert answer["spread"]["variance_share"] < 0.25
     assert answer["read_noise_DN"]["low"] == 0.0 < answer["read_noise_DN"]["high"]
     assert any("pairs of single flats" in line for line in answer["warnings"])
+
+
+def test_the_page_of_the_real_line_states_the_read_noise_of_its_own_commands(tmp_path):
+    import_images(FRAMES, tmp_path / "line.h5")
+    noise = rt.calibrate(tmp_path / "line.h5").noise.read_noise_DN
+    row = f"| read noise | {noise.value:.0f} DN ({noise.low:.0f} to {noise.high:.0f}) |"
+    assert row in (ROOT / "docs" / "real_line.md").read_text(encoding="utf-8")
 
 
 def test_the_page_of_the_real_line_runs(tmp_path, monkeypatch, capsys):

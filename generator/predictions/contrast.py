@@ -10,7 +10,6 @@ Left out: scatter, the noise of the flat, and the softening of the object's edge
 """
 
 import math
-import numbers
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -380,7 +379,7 @@ def _checked_slabs(product: Filter, foreign_object: Filter, displaces: bool, obj
             received=f"{foreign_object.thickness_mm:g} mm",
             expected=f"at most the product's {product.thickness_mm:g} mm, whose place it takes",
         )
-    whole = isinstance(object_pixels, numbers.Integral) and not isinstance(object_pixels, bool)
+    whole = isinstance(object_pixels, int | np.integer) and not isinstance(object_pixels, bool)
     if not whole or not 1 <= object_pixels <= MAXIMUM_OBJECT_PIXELS:
         raise InputError(
             "object pixels", received=object_pixels, expected=f"a whole number from 1 to {MAXIMUM_OBJECT_PIXELS}"

@@ -78,25 +78,6 @@ def _compression(request: Asked, site: Site) -> Planted:
     )
 
 
-def _recursive_filter(request: Asked, site: Site) -> Planted:
-    kept = request.strength / 100.0
-
-    def smooth(numbers: NDArray[Any], context: FrameContext) -> NDArray[Any]:
-        image = numbers.astype(np.float32)
-        before = context.memory.get("recursive_filter")
-        # a series that is stored as means of frames keeps as much less of the frame before
-        shown = image if before is None else image + np.float32(kept / context.summed) * (before - image)
-        context.memory["recursive_filter"] = shown
-        return _digitised(shown, context)
-
-    return _told(
-        request,
-        "a recursive filter in the firmware: a share of each frame is the one shown before",
-        {},
-        stages=(("digitise", Stage(name="recursive_filter", apply=smooth, additive=False)),),
-    )
-
-
 def _lookup_table(request: Asked, site: Site) -> Planted:
     waves = float(np.exp(site.rng.uniform(np.log(6.0), np.log(40.0))))  # over the range of the numbers
     begins = float(site.rng.uniform(0.0, 2.0 * math.pi))
@@ -132,9 +113,6 @@ UNKNOWN_LAWS: tuple[EffectLaw, ...] = (
     ),
     _law("sharpening", "sharpening in the firmware", "%", (3.0, 80.0), _sharpening, "calibration"),
     _law("compression", "lossy compression", "DN", (8.0, 200.0), _compression, "calibration"),
-    _law(
-        "recursive_filter", "frames averaged with the ones before", "%", (3.0, 40.0), _recursive_filter, "calibration"
-    ),
     _law("lookup_table", "a look-up table that waves", "DN", (20.0, 400.0), _lookup_table, "calibration"),
 )
 UNKNOWN_UNITS = {law.id: law.unit for law in UNKNOWN_LAWS}

@@ -609,15 +609,6 @@ def test_sharpening_keeps_flats_and_overshoots_at_edges():
     assert out.max() > 5000 + 0.1 * 4000 and out.min() < 1000 - 0.1 * 4000
 
 
-def test_a_recursive_filter_shows_a_share_of_the_frame_before():
-    recursive = stage_of(planted("unknown:recursive_filter=25"))
-    context = context_of(system_on("coarse"))
-    first, second = (np.full((SIZE, SIZE), level, dtype=np.uint16) for level in (1000, 2000))
-    assert np.array_equal(recursive(first, context), first)
-    assert np.all(recursive(second, context) == 1750)
-    assert np.all(recursive(second, context) == 1938)  # of what was shown, not of what came in
-
-
 def test_a_waving_look_up_table_moves_numbers_by_its_strength_and_leaves_0_alone():
     effect = planted("unknown:lookup_table=100")
     system = system_on("coarse")

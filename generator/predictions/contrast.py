@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ...acquisition.contrast import PRODUCT_THRESHOLD, dilations_for_pixel
 from ...acquisition.setting import Filter, Setting, text_from_filters
-from ...errors import InputError
+from ...errors import InputError, check_whole
 from ...materials import TABLES, Library, material_from_name, mu_per_mm, transmission
 from ...spectra import (
     BIN_WIDTH_KEV,
@@ -379,8 +379,8 @@ def _checked_slabs(product: Filter, foreign_object: Filter, displaces: bool, obj
             received=f"{foreign_object.thickness_mm:g} mm",
             expected=f"at most the product's {product.thickness_mm:g} mm, whose place it takes",
         )
-    whole = isinstance(object_pixels, int | np.integer) and not isinstance(object_pixels, bool)
-    if not whole or not 1 <= object_pixels <= MAXIMUM_OBJECT_PIXELS:
+    check_whole("object pixels", object_pixels, least=1)
+    if object_pixels > MAXIMUM_OBJECT_PIXELS:
         raise InputError(
             "object pixels", received=object_pixels, expected=f"a whole number from 1 to {MAXIMUM_OBJECT_PIXELS}"
         )

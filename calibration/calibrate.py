@@ -26,8 +26,17 @@ from .next_measurement import advice, voltages_within_reach
 from .output_table import OutputTable
 from .photon_transfer import PhotonTransfer, compute_photon_transfer
 from .priors import PRIORS
-from .setting_errors import allowing_for_settings
-from .spectral_fit import SpectralFit, Transmission, contradicts, fit_evidence, fit_spectrum, model_for, unlike_output
+from .setting_errors import allowing_for_darks, allowing_for_settings, mean_change
+from .spectral_fit import (
+    SpectralFit,
+    Transmission,
+    contradicts,
+    fit_evidence,
+    fit_spectrum,
+    model_for,
+    unlike_output,
+    wedges_depart,
+)
 from .transmission_table import TransmissionTable
 from .tube import DoseData, dose_data, fit_without_strays, table_evidence
 from .wedges import measure_transmissions, wedge_evidence
@@ -102,6 +111,7 @@ def calibrate_twin(
                 levels,
                 acquisition.instrument,
                 rng=rng,
+                dark_changes=[mean_change(level, transfer.dark_changes) for level in levels],
                 spectra=spectra,
                 transmissions=behind,
                 noise=transfer.noise,
@@ -113,7 +123,7 @@ def calibrate_twin(
         try:
             fit, doses, told = fit_without_strays(doses, fit_of)
             warnings += told
-            if transmissions and contradicts(fit):
+            if transmissions and (contradicts(fit) or wedges_depart(fit)):
                 without = fit_of(doses, ())
                 if not contradicts(without):
                     fit = without
@@ -150,7 +160,7 @@ def calibrate_twin(
         maps=transfer.maps,
         noise=transfer.noise,
         dark_DN=transfer.dark_DN,
-        levels=transfer.levels,
+        levels=allowing_for_darks(transfer.levels, transfer.dark_changes),
         spectral=spectral,
         evidence=evidence,
         warnings=tuple(warnings),

@@ -75,6 +75,14 @@ class DarkFrames:
         wanted = item.exposure_ms
         return (sessions[0], min(known, key=lambda exposure: abs(exposure - wanted)))
 
+    def unknown_growth_ms(self, item: Series) -> float:
+        """By how much the exposure of a series is longer than that of its dark frame, where no session has darks at two exposures."""
+        known = {key for key in self.by_exposure if key[1] is not None}
+        key = self.key_of(item)
+        if len(known) > len({session for session, _ in known}) or key is None or key[1] is None:
+            return 0.0
+        return 0.0 if item.exposure_ms is None else item.exposure_ms - key[1]
+
     def exposures_of(self, item: Series) -> int:
         """How many exposures the dark frame of a series is the mean of; 0 where it is taken off already."""
         key = self.key_of(item)

@@ -27,7 +27,8 @@ class SeriesPoint:
     Fields: series, kV, filters, exposure_ms, load_mAs (None where unknown), frames, averaged, signal_DN (median),
     mean_signal_DN, pair_variance_DN2, stack_variance_DN2 (of one single frame: averaging undone; of a flat without a
     second frame what other series of its beam show), used (False: masked, with the reason in `masked`), drift_percent
-    (change of the frame mean over the series), common_mode_percent (rms output noise from frame to frame).
+    (change of the frame mean over the series), common_mode_percent (rms output noise from frame to frame), unknown_growth_ms
+    (`DarkFrames.unknown_growth_ms`).
     """
 
     series: str
@@ -47,6 +48,7 @@ class SeriesPoint:
     masked: str
     drift_percent: float
     common_mode_percent: float
+    unknown_growth_ms: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers for JSON."""
@@ -66,6 +68,7 @@ class SeriesPoint:
             "masked": self.masked,
             "drift_percent": self.drift_percent,
             "common_mode_percent": self.common_mode_percent,
+            "unknown_growth_ms": self.unknown_growth_ms,
         }
 
 
@@ -107,6 +110,7 @@ def series_points(
                 masked=why,
                 drift_percent=drift,
                 common_mode_percent=100.0 * math.sqrt(source.power.common_mode) if source else 0.0,
+                unknown_growth_ms=darks.unknown_growth_ms(item),
             )
         )
     return tuple(points)

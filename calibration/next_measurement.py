@@ -16,6 +16,7 @@ from ..generator.line.twin import Z95, Estimate, Twin
 from ..generator.predictions.predict import spectral_model_of
 from ..materials import material_from_name, transmission
 from ..spectra import MAXIMUM_KV_OF_ANODE, MINIMUM_KV
+from .priors import WEDGE_THICKNESS
 
 # what a person has at hand: plates for the beam, and a wedge of aluminium
 _PLATES = ("", "Cu:0.1", "Al:2", "Cu:0.5")
@@ -159,6 +160,7 @@ def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
     before = np.mean(wanted**2, axis=1)
     rate_noise = _median_relative_sd([level.rate_DN_per_mAs for level in measured])
     gain_noise = _median_relative_sd([level.photon_transfer_slope_DN for level in measured])
+    # kind, setting, steps, logarithms seen (datum, draw), their noise (datum, datum)
     candidates: list[tuple[str, Setting, tuple[Filter, ...], NDArray[np.float64], NDArray[np.float64]]] = []
     for kV in every_kV:
         for filters in plates:
@@ -167,12 +169,12 @@ def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
             setting = _exposed(twin, kV, filters, float(np.exp(np.median(logs(kV, filters)[0]))))
             if setting is not None:
                 noise = np.array([math.hypot(rate_noise, level_sd), math.hypot(gain_noise, gain_sd)]) ** 2
-                candidates.append(("flats", setting, (), logs(kV, filters)[:2], noise))
+                candidates.append(("flats", setting, (), logs(kV, filters)[:2], np.diag(noise)))
     for kV in every_kV:
         for filters in sorted(stacks, key=str):
             setting = _exposed(twin, kV, filters, float(np.exp(np.median(logs(kV, filters)[0]))))
             if _passes(filters, kV) and setting is not None:
-                candidates.append(("dose", setting, (), logs(kV, filters)[2:], np.array([_DOSE_SD**2 + level_sd**2])))
+                candidates.append(("dose", setting, (), logs(kV, filters)[2:], np.array([[_DOSE_SD**2 + level_sd**2]])))
     for level in measured:
         kV, filters = float(level.kV or 0.0), level.filters
         setting = _exposed(twin, kV, filters, float(np.exp(np.median(logs(kV, filters)[0]))))
@@ -181,7 +183,9 @@ def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
         steps = tuple(Filter(material="Al", thickness_mm=mm) for mm in _WEDGE_MM)
         open_rate = logs(kV, filters)[0]
         behind = np.array([logs(kV, (*filters, step))[0] - open_rate for step in steps])
-        candidates.append(("wedge", setting, steps, behind, np.full(len(steps), _WEDGE_SD**2 + level_sd**2)))
+        of_thickness = WEDGE_THICKNESS.sd * behind.mean(axis=1)
+        noise = np.outer(of_thickness, of_thickness) + (_WEDGE_SD**2 + level_sd**2) * np.eye(len(steps))
+        candidates.append(("wedge", setting, steps, behind, noise))
     ranked = []
     half_width = Z95 * np.sqrt(before + floor)
     width = 100.0 * float(np.mean(half_width[::3]))
@@ -193,7 +197,7 @@ def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
     for kind, setting, steps, seen, noise in candidates:
         centred = seen - seen.mean(axis=1, keepdims=True)
         cross = wanted @ centred.T / draws
-        own = centred @ centred.T / draws + np.diag(noise + _RIDGE)
+        own = centred @ centred.T / draws + noise + _RIDGE * np.eye(len(noise))
         gained = np.sum(cross * np.linalg.solve(own, cross.T).T, axis=1)
         after = Z95 * np.sqrt(np.maximum(before - gained, 0.0) + floor)
         shrinks_to, dose_shrinks_to = (

@@ -5,7 +5,7 @@ series for the noise power, once the bad pixels are known.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -46,7 +46,7 @@ from .repeated_frames import (
     series_of_beams,
     warning_of,
 )
-from .setting_errors import setting_errors, told_errors
+from .setting_errors import dark_changes, dark_current_sd, setting_errors, told_darks, told_errors
 from .spread_fit import SpreadFit
 
 ESTIMATORS = ("pairs", "stack")
@@ -60,13 +60,14 @@ SumsOf = Callable[[Series], KeptSums]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotonTransfer:
-    """Everything that the flats and darks say without a spectrum."""
+    """Everything that the flats and darks say without a spectrum; dark_changes: what `levels` do not allow for yet."""
 
     maps: DetectorMaps
     noise: NoiseModel
     dark_DN: Estimate
     levels: tuple[Level, ...]
     points: tuple[SeriesPoint, ...]
+    dark_changes: Mapping[str, float]
     fit: SpreadFit
     evidence: dict[str, Any]
     warnings: tuple[str, ...]
@@ -435,9 +436,13 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
     evidence, found = flat_evidence(points, noise, darks, good)
     warnings += found
     evidence["estimator"] = estimator
+    used, instrument = [point for point in points if point.used], session.acquisition.instrument
+    growths = [float(np.median(mean[good])) / ms for (_, ms), mean in darks.by_exposure.items() if ms]
+    dark_sd = dark_current_sd(min(growths, default=0.0), bits=instrument.bits)
     evidence["setting_errors"] = setting_errors(
-        [point for point in points if point.used], source_detector_mm=session.acquisition.instrument.source_detector_mm
+        used, source_detector_mm=instrument.source_detector_mm, dark_DN_per_ms_sd=dark_sd
     )
+    changes = dark_changes(used, evidence["setting_errors"], dark_DN_per_ms_sd=dark_sd)
     evidence["clusters"] = cluster_evidence(flats.bad)
     evidence["maps"] = {
         "gain_relative_sd": gain_sd,
@@ -445,7 +450,7 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
         "read_variance_relative_sd": read_relative_sd,
         "dark_sd_DN": dark_map_sd(darks, good, last, exposure_ms, fit.read_variance_DN2),
     }
-    warnings += told_errors(evidence["setting_errors"])
+    warnings += [*told_errors(evidence["setting_errors"]), *told_darks(used, changes)]
     if flats.others:
         evidence["repeated_frames"] = evidence_of(flats.others, good)
         warnings.append(warning_of(evidence["repeated_frames"]))
@@ -486,6 +491,7 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
         dark_DN=dark_DN,
         levels=levels_of(session.acquisition, noise, darks, good, points=points, saturation_DN=flats.saturation_DN),
         points=points,
+        dark_changes=changes,
         fit=fit,
         evidence=evidence,
         warnings=tuple(warnings),

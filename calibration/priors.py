@@ -274,6 +274,16 @@ COUNTED_MORE_SHARE = 0.5
 # shared charge over the logarithm of gain over slope, and its uncertainty: shared at random by two pixels, all charge raises that by
 # 0.3 (threshold at 0.4 of the energy) to 0.7 (at 0.05)
 SHARED_OVER_EXCESS, SHARED_OVER_EXCESS_SD = 2.0, 1.0
+# in standard deviations of what `setting_errors` knows of it
+DARK_CURRENT = "dark_current"
+DARK_CURRENT_PRIOR = Prior(centre=0.0, sd=1.0, reason="dark current, of which darks at one exposure tell nothing")
+# EN 485-4 allows 3 mm sheet 0.10 mm, a limit, whose law is rectangular; what iron and silicon of EN AW-1050A (EN 573-3, 99.5 % Al)
+# add to the attenuation of aluminium at 40 keV is 2 % (6 % in EN AW-6082)
+WEDGE_THICKNESS = Prior(
+    centre=0.0,
+    sd=math.hypot(0.10 / 3.0 / math.sqrt(3.0), 0.02),
+    reason="of all steps of a wedge: tolerance of rolled sheet, iron and silicon in commercially pure aluminium",
+)
 ATTENUATION_SCALE = Prior(centre=0.0, sd=0.01, reason="density and thickness of a filter")
 TABLE_SHARE = Prior(
     centre=0.33, sd=0.47, reason="0 is xraylib, 1 the other table: xraylib, Chantler and PENELOPE are equally likely"

@@ -51,6 +51,8 @@ from .priors import (
     COUNT_SD,
     COUNTED_MORE_SHARE,
     COUNTING_SWANK,
+    DARK_CURRENT,
+    DARK_CURRENT_PRIOR,
     FREE_OUTPUT,
     GADOLINIUM_SHARE,
     GAIN_DISCREPANCY,
@@ -67,6 +69,7 @@ from .priors import (
     UNDECLARED_SCINTILLATOR,
     UNDECLARED_THRESHOLD,
     UNLIKE_OUTPUT,
+    WEDGE_THICKNESS,
     Prior,
     ripple_from_latent,
     spread_of,
@@ -163,7 +166,10 @@ def fit_evidence(fit: SpectralFit) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Transmission:
-    """Signal behind known layers over the open signal at one kV and filter, with its relative standard deviation."""
+    """Signal behind known layers over the open signal at one kV and filter, with its relative standard deviation.
+
+    wedge: name of the object, whose thicknesses and density are off alike at all its steps and voltages.
+    """
 
     kV: float
     filters: tuple[Filter, ...]
@@ -171,6 +177,7 @@ class Transmission:
     value: float
     relative_sd: float
     series: str = ""
+    wedge: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +188,9 @@ class _Datum:
     value: float  # logarithm
     sd: float
     of: tuple[str, int]  # measurement: a level gives its rate and its gain
-    calibration: float = 0.0  # of a kerma: the uncertainty of its dosimeter's calibration over the table's mean
+    moves: tuple[
+        tuple[str, float], ...
+    ] = ()  # parameters that no beam has, and by how much a unit of each moves the value
 
 
 # kind of a datum -> whose learned size is its own departure from the model; the sizes' medians
@@ -200,6 +209,9 @@ _DISCREPANCIES = {
     "ratio": RATIO_DISCREPANCY,
 }
 _OUTPUT = "log_output"
+_WEDGE = "wedge_log_thickness:"
+_WEDGE_DEPARTS = 2.5  # prior standard deviations: one wedge in 80 departs so far
+_THICKER = 0.01  # relative, of the derivative by a wedge's thickness
 # standard deviations of the prior from which on the output is looked at, and of prior and data from which on it is not believed:
 # Gaussian, 3 in 1000 lines with right labels have it
 _OUTPUT_LOOKED_AT, _UNLIKE = 2.0, 3.0
@@ -393,6 +405,7 @@ def fit_spectrum(
     repeats: Sequence[Mapping[str, Any]] = (),
     kermas: Sequence[KermaReading] = (),
     ratios: Sequence[KermaRatio] = (),
+    dark_changes: Sequence[float] = (),
 ) -> SpectralFit:
     """Posterior of the spectral parameters from measured levels, gains, transmissions and dosimeter readings.
 
@@ -412,11 +425,14 @@ def fit_spectrum(
         repeats: settings measured more than once (`repeated_settings` of the evidence): how far their levels scatter
             beyond sampling tells how well the line repeats itself.
         kermas, ratios: what dosimeters say; they calibrate the tube without any level, too.
+        dark_changes: by how much a dark current of one standard deviation makes each of `levels` too high, relative, and its
+            gain too low; none: the darks tell it.
 
     Raises:
         FitError: no level with a kV and no dosimeter reading, or the posterior cannot be sampled.
     """
     known = [level for level in levels if level.kV is not None]
+    dark = [change for level, change in zip(levels, dark_changes, strict=False) if level.kV is not None]
     if not known and not kermas and not ratios:
         raise FitError("no flat series states its kV, so nothing can be said of the spectrum")
     if spectra:
@@ -452,8 +468,17 @@ def fit_spectrum(
     absorbers = absorber_priors(model, np.array([priors[name].centre for name in model.names]), ratios)
     if absorbers:
         model, priors = model.with_parameters(tuple(absorbers)), priors | absorbers
+    added = {wedge_thickness_name(item.wedge): WEDGE_THICKNESS for item in transmissions}
+    added |= {DARK_CURRENT: DARK_CURRENT_PRIOR} if any(dark) else {}
+    if added:
+        model, priors = model.with_parameters(tuple(added)), priors | added
     beams: dict[OpenBeam, int] = {}
-    data = [*_data(known, transmissions, instrument, noise, beams), *_dose_data(kermas, ratios, beams)]
+    centre = np.array([[priors[name].centre for name in model.names]])
+    data = [
+        *_level_data(known, instrument, noise, beams, dark=dark if any(dark) else [0.0] * len(known)),
+        *_transmission_data(transmissions, model, centre, beams),
+        *_dose_data(kermas, ratios, beams),
+    ]
     fixed = {"level": level_discrepancy, "gain": gain_discrepancy}
 
     def posterior_of(with_priors: dict[str, Prior], data: Sequence[_Datum]) -> _Posterior:
@@ -574,39 +599,75 @@ def _shares(levels: Sequence[Level], noise: NoiseModel | None) -> list[float]:
     return [math.exp(float(np.mean(ratios)))] * len(levels)
 
 
-def _data(
+def wedge_thickness_name(wedge: str) -> str:
+    """Name of the parameter that scales the thicknesses of a wedge."""
+    return f"{_WEDGE}{wedge}"
+
+
+def wedges_depart(fit: SpectralFit) -> bool:
+    """Whether a wedge is thicker or thinner than stated by more than `_WEDGE_DEPARTS` standard deviations of what wedges are."""
+    posterior = fit.posterior
+    off = [abs(float(np.mean(posterior.column(name)))) for name in posterior.names if name.startswith(_WEDGE)]
+    return max(off, default=0.0) > _WEDGE_DEPARTS * WEDGE_THICKNESS.sd
+
+
+def _level_data(
     levels: Sequence[Level],
-    transmissions: Sequence[Transmission],
     instrument: Instrument,
     noise: NoiseModel | None,
     beams: dict[OpenBeam, int],
+    *,
+    dark: Sequence[float],
 ) -> list[_Datum]:
-    def number(kV: float, filters: tuple[Filter, ...]) -> int:
-        return beams.setdefault(OpenBeam(kV=kV, filters=filters), len(beams))
-
     # A gain also wants the spread, by which all of them are off alike: slopes over one ratio carry the gains' dependence on
     # the spectrum, and what the ratio is known less by is added to predictions, where no average over beams lowers it.
     sloped = [level for level in levels if level.photon_transfer_slope_DN.value > 0 and level.gain_DN.value > 0]
     share = dict(zip(map(id, levels), _shares(levels, noise), strict=True)) if sloped else {}
     data = []
     for place, level in enumerate(levels):
-        beam = number(level.kV or 0.0, level.filters)
-        rate = level.rate_DN_per_mAs
+        open_beam = OpenBeam(kV=level.kV or 0.0, filters=level.filters)
+        beam, rate = beams.setdefault(open_beam, len(beams)), level.rate_DN_per_mAs
+        too_high, too_low = (((DARK_CURRENT, sign * dark[place]),) if dark[place] else () for sign in (1.0, -1.0))
         if rate is not None and rate.value > 0:
             factor = geometry_factor(source_detector_mm=level.source_detector_mm, pixel_mm=instrument.pixel_mm)
-            data.append(_Datum("rate", beam, -1, math.log(rate.value / factor), _relative_sd(rate), ("level", place)))
+            data.append(
+                _Datum("rate", beam, -1, math.log(rate.value / factor), _relative_sd(rate), ("level", place), too_high)
+            )
         gain = level.photon_transfer_slope_DN if share else level.gain_DN
         value = gain.value / share.get(id(level), 1.0)
-        data.append(_Datum("gain", beam, -1, math.log(max(value, 1e-12)), _relative_sd(gain), ("level", place)))
+        data.append(
+            _Datum("gain", beam, -1, math.log(max(value, 1e-12)), _relative_sd(gain), ("level", place), too_low)
+        )
+    return data
+
+
+def _transmission_data(
+    transmissions: Sequence[Transmission],
+    model: SpectralModel,
+    centre: NDArray[np.float64],
+    beams: dict[OpenBeam, int],
+) -> list[_Datum]:
+    """centre: parameter set (1, parameter) at which the thickness's derivative is taken."""
+
+    def signal(beam: OpenBeam) -> float:
+        return math.log(float(model.signal(centre, beam).rate_DN_per_mAs[0]))
+
+    data = []
     for place, item in enumerate(transmissions):
+        thicker = [replace(layer, thickness_mm=math.exp(_THICKER) * layer.thickness_mm) for layer in item.layers]
+        open_beam, behind, farther = (
+            OpenBeam(kV=item.kV, filters=(*item.filters, *layers)) for layers in ((), item.layers, thicker)
+        )
+        falls = (signal(farther) - signal(behind)) / _THICKER
         data.append(
             _Datum(
                 "transmission",
-                number(item.kV, (*item.filters, *item.layers)),
-                number(item.kV, item.filters),
+                beams.setdefault(behind, len(beams)),
+                beams.setdefault(open_beam, len(beams)),
                 math.log(item.value),
                 item.relative_sd,
                 ("transmission", place),
+                ((wedge_thickness_name(item.wedge), falls),),
             )
         )
     return data
@@ -621,7 +682,8 @@ def _dose_data(
     data = []
     for place, item in enumerate(kermas):
         beam, value = number(item.kV, item.filters), math.log(item.value)
-        data.append(_Datum("kerma", beam, -1, value, item.relative_sd, ("kerma", place), item.calibration_sd))
+        moves = ((DOSIMETER_CALIBRATION, item.calibration_sd),)
+        data.append(_Datum("kerma", beam, -1, value, item.relative_sd, ("kerma", place), moves))
     for place, ratio in enumerate(ratios):
         behind = number(ratio.kV, (*ratio.filters, *ratio.layers), ratio.absorber)
         kind = "signal_ratio" if ratio.of_signal else "kerma_ratio"
@@ -758,9 +820,21 @@ class _Posterior:
         value = np.empty((len(parameters), len(self.data)))
         slope = np.empty((len(parameters), len(self.data), len(self.linear)))
         self._expected_kermas(parameters, value, slope)
+        self._expected_signals(parameters, value, slope)
+        for column, item in enumerate(self.data):
+            for name, by in item.moves:
+                slope[:, column, self.linear_names.index(name)] = by
+                # the derivatives may stand where the data put this parameter
+                value[:, column] += parameters[:, self.model.names.index(name)] * by
+        return value, slope
+
+    def _expected_signals(
+        self, parameters: NDArray[np.float64], value: NDArray[np.float64], slope: NDArray[np.float64]
+    ) -> None:
+        """Fill in what the model expects of the detector's data: see `expectation`."""
         seen = {place for item in self.data if item.kind in _OF_DETECTOR for place in (item.beam, item.over)}
         if not seen:
-            return value, slope
+            return
         deposits = self.model.deposit_tables(parameters)
         found = {
             place: self.model.log_derivatives(parameters, beam, self.linear_names, deposits=deposits)
@@ -776,7 +850,6 @@ class _Posterior:
             if item.over >= 0:
                 value[:, column] -= found[item.over][0][0]
                 slope[:, column] -= found[item.over][1]
-        return value, slope
 
     def _expected_kermas(
         self, parameters: NDArray[np.float64], value: NDArray[np.float64], slope: NDArray[np.float64]
@@ -793,11 +866,8 @@ class _Posterior:
                 value[:, column] -= found[item.over][0]
                 slope[:, column] -= found[item.over][1]
                 hardness = hardness - found[item.over][2]
-            for name, by in ((DOSIMETER_HARDNESS, hardness), (DOSIMETER_CALIBRATION, item.calibration)):
-                if name in self.linear_names:
-                    slope[:, column, self.linear_names.index(name)] = by
-                    # the derivatives may stand where the data put this parameter
-                    value[:, column] += parameters[:, self.model.names.index(name)] * by
+            slope[:, column, self.linear_names.index(DOSIMETER_HARDNESS)] = hardness
+            value[:, column] += parameters[:, self.model.names.index(DOSIMETER_HARDNESS)] * hardness
 
     @property
     def _largest_variances(self) -> NDArray[np.float64]:

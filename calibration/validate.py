@@ -23,6 +23,8 @@ from ..generator.line.twin import Z95, Estimate, Twin
 from ..generator.predictions.predict import predict_flatfield
 from ..results import Result, Table, axes_or_new, counted, frame, plain
 from .frame_sums import effective_frames, sum_frames
+from .priors import WEDGE_THICKNESS
+from .spectral_fit import Transmission
 from .wedges import measure_transmissions, predict_transmission, transmissions_of_evidence
 
 if TYPE_CHECKING:
@@ -362,6 +364,11 @@ def _dark_means(acquisition: AcquisitionFile) -> dict[float | None, NDArray[np.f
     }
 
 
+def _sd_of_step(item: Transmission) -> float:
+    """Standard deviation of a measured transmission, the thickness that all steps of its wedge share included."""
+    return item.value * math.hypot(item.relative_sd, WEDGE_THICKNESS.sd * math.log(item.value))
+
+
 def _wedge_rows(
     twin: Twin, acquisition: AcquisitionFile, skipped: list[str], *, known: Sequence[bool]
 ) -> tuple[WedgeRow, ...]:
@@ -390,7 +397,7 @@ def _wedge_rows(
                     filters=text_from_filters(item.filters),
                     layers=text_from_filters(item.layers),
                     measured=item.value,
-                    predicted=_widened(predicted, item.relative_sd * item.value),
+                    predicted=_widened(predicted, _sd_of_step(item)),
                     used_in_calibration=seen,
                 )
             )

@@ -22,7 +22,7 @@ from .spectral_fit import Transmission
 KINDS = ("wedge", "slab")
 # A transmission carries at least this: scatter, flatness, the flat's own drift.
 TRANSMISSION_SD = 0.002
-# Tolerance of a step's thickness and density, each step on its own.
+# Tolerance of a step's thickness, each step on its own; what all steps share is `WEDGE_THICKNESS`.
 THICKNESS_SD = 0.005
 _LEAST = 0.02  # transmissions below are mostly scatter
 _PIXELS = 20  # a step of fewer is left out
@@ -130,6 +130,7 @@ def _transmissions_of(
                 value=value,
                 relative_sd=math.hypot(noise, TRANSMISSION_SD, THICKNESS_SD * math.log(value)),
                 series=item.name,
+                wedge=item.scene,
             )
         )
     if not result:
@@ -262,6 +263,7 @@ def transmissions_of_evidence(twin: Twin) -> tuple[Transmission, ...]:
             value=float(row["transmission"]),
             relative_sd=float(row["relative_sd"]),
             series=str(row["series"]),
+            wedge=str(row["scene"]),
         )
         for row in twin.evidence.get("wedges") or ()
         if "transmission" in row and row.get("used", True)

@@ -15,6 +15,7 @@ from raytwin.calibration.setting_errors import (
     DISTANCE_SD,
     EXPOSURE_SD_MS,
     allowing_for_settings,
+    dark_current_sd,
     setting_errors,
     told_errors,
 )
@@ -24,6 +25,7 @@ from raytwin.generator.line.twin import Z95
 from raytwin.generator.predictions.predict import predict_flatfield
 
 MM, COPPER = 1059.0, filters_from_text("Cu:0.05")
+DARK_SD = dark_current_sd(400.0 / 100.0, bits=16)  # DN/ms, of a dark of 400 DN at 100 ms
 
 
 def flat(number, *, kV=80.0, ms=100.0, mm=None, late_ms=0.0, near_mm=0.0):
@@ -128,6 +130,51 @@ def test_predictions_hold_exposures_that_are_longer_than_stated(tmp_path, make_m
         if len(measured_ms) == 1:
             expected = Z95 * EXPOSURE_SD_MS * (1 / 20 - 1 / 100)
             assert half_width(short) == pytest.approx(math.hypot(half_width(there), expected), rel=0.15)
+
+
+@pytest.mark.parametrize("darks_ms", [(100.0,), (100.0, 20.0)])
+def test_levels_hold_a_dark_current_that_darks_of_another_exposure_do_not_tell(tmp_path, make_model_twin, darks_ms):
+    line, rng = make_model_twin((64, 64)), np.random.default_rng(0)
+
+    def at(kV, ms=20.0):
+        return Setting(kV=kV, current_mA=1.0, exposure_ms=ms, filters=COPPER)
+
+    def frames(mean_DN, sd_DN, ms):
+        return np.round(300.0 + ms + mean_DN + sd_DN * rng.standard_normal((6, 64, 64))).astype(np.uint16)
+
+    with write_acquisition(tmp_path / "flats.h5", line.instrument) as writer:
+        for ms in darks_ms:
+            writer.add_series(f"dark_{ms:g}", kind="dark", exposure_ms=ms, frames=frames(0.0, 12.0, ms))
+        for kV in (40.0, 90.0):
+            light = predict_flatfield(line, at(kV))
+            shown = frames(light.mean_DN.value, light.sd_DN.value, 20.0)
+            writer.add_series(f"flat_{kV:g}", kind="flat", setting=at(kV), frames=shown)
+    with open_acquisition(tmp_path / "flats.h5") as acquisition:
+        twin = calibrate_twin(acquisition, rng=np.random.default_rng(0), advise=False)
+    told = [text for text in twin.warnings if "measure darks at 20 ms" in text]
+    assert len(told) == int(len(darks_ms) == 1)
+    for kV in (40.0, 65.0, 90.0):
+        found, truth = predict_flatfield(twin, at(kV)), predict_flatfield(line, at(kV))
+        assert found.mean_DN.low < truth.mean_DN.value < found.mean_DN.high
+    for level in twin.levels:
+        light = predict_flatfield(line, at(level.kV))
+        wide = half_width(level.rate_DN_per_mAs) > 80.0 * DARK_SD / light.mean_DN.value
+        assert wide == (len(darks_ms) == 1)
+        slope = (light.sd_DN.value**2 - 12.0**2) / light.mean_DN.value
+        assert level.photon_transfer_slope_DN.low < slope < level.photon_transfer_slope_DN.high
+
+
+def test_flats_of_two_currents_tell_the_dark_current():
+    points = [
+        dataclasses.replace(flat(0), signal_DN=2000.0 - 40.0, unknown_growth_ms=-80.0),
+        dataclasses.replace(flat(1), signal_DN=500.0 - 40.0, load_mAs=0.025, unknown_growth_ms=-80.0),
+    ]
+    found = setting_errors(points, source_detector_mm=MM, dark_DN_per_ms_sd=DARK_SD)
+    assert found["dark_DN_per_ms"]["value"] == pytest.approx(0.5, abs=0.2)
+    assert found["dark_DN_per_ms"]["sd"] < 0.5 * DARK_SD
+    assert np.shape(found["second_moments"]) == (3, 3)
+    # no dark current where darks tell it: nothing is learned of it
+    assert "dark_DN_per_ms" not in setting_errors([flat(0), flat(1)], source_detector_mm=MM, dark_DN_per_ms_sd=DARK_SD)
 
 
 def test_evidence_of_older_twins_says_nothing_and_damaged_evidence_is_refused(make_model_twin):

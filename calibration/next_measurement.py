@@ -77,7 +77,8 @@ def advice(twin: Twin) -> dict[str, Any] | None:
 
     Returns:
         `NextMeasurement.as_dict` of the first of `rank_measurements`; `carries`, a sentence on the voltages that were not
-        measured, which also follows the `text`; `alternatives`, the best flats at another voltage and at a measured one, the
+        measured, which also follows the `text`; `exposures`, one before it where levels at other exposures are less known than
+        those at other beams; `alternatives`, the best flats at another voltage and at a measured one, the
         best wedge and the best reading of dose, as dicts of `kind`, `text`, `setting`, `shrinks_to` and `dose_shrinks_to`.
         None: nothing can be named.
     """
@@ -91,8 +92,28 @@ def advice(twin: Twin) -> dict[str, Any] | None:
     kept = ("kind", "text", "setting", "shrinks_to", "dose_shrinks_to")
     rows = [{name: value for name, value in item.as_dict().items() if name in kept} for item in best.values()]
     carries = _carries(ranked[0], twin)
-    text = ranked[0].text if carries is None else f"{ranked[0].text}. {carries}"
-    return ranked[0].as_dict() | {"text": text, "carries": carries, "alternatives": rows}
+    exposures = _exposures(twin, ranked[0].width_percent)
+    text = ". ".join(filter(None, (exposures, ranked[0].text, carries)))
+    return ranked[0].as_dict() | {"text": text, "carries": carries, "exposures": exposures, "alternatives": rows}
+
+
+def _exposures(twin: Twin, width_percent: float) -> str | None:
+    """That flats at a second exposure time are wanted, in a sentence: where what one time leaves open at half of it is more than
+    `width_percent`. None where a belt sets the time.
+    """
+    times_ms = {flat.exposure_ms for flat in measured_flats(twin) if flat.exposure_ms}
+    errors = twin.evidence.get("setting_errors")
+    if len(times_ms) != 1 or errors is None or twin.instrument.detector == "tdi":
+        return None
+    (time_ms,) = times_ms
+    # one change of 1 / t ms, from the exposure to half of it
+    open_percent = 100.0 * Z95 * float(errors["exposure_ms"]["sd"]) / time_ms
+    if open_percent <= width_percent:
+        return None
+    return (
+        f"Flats at a second exposure time beside {time_ms:g} ms: from one, levels at {0.5 * time_ms:g} ms are known to"
+        f" +-{open_percent:.2g} % at best"
+    )
 
 
 def _carries(first: NextMeasurement, twin: Twin) -> str | None:

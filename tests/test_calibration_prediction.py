@@ -155,6 +155,25 @@ def test_candidates_are_sorted_within_reach_and_not_measured_yet(model, truth):
     assert answer["setting"] in answer["text"] or answer["wedge"]
 
 
+def test_advice_asks_for_a_second_exposure_time_where_one_leaves_most_open(model, truth):
+    def told(*times_ms, detector=None):
+        twin = twin_of(model, truth, [(50.0, ""), (90.0, "")])
+        rows = [{**row, "exposure_ms": ms} for ms in times_ms for row in twin.evidence["photon_transfer"]]
+        errors = {"exposure_ms": {"value": 0.0, "sd": 0.36}}
+        return advice(
+            replace(
+                twin,
+                evidence=twin.evidence | {"photon_transfer": rows, "setting_errors": errors},
+                instrument=replace(twin.instrument, detector=detector),
+            )
+        )["exposures"]
+
+    assert told(1.0).startswith(
+        "Flats at a second exposure time beside 1 ms: from one, levels at 0.5 ms are known to +-71 %"
+    )
+    assert told(1.0, 2.0) is told(1000.0) is told(1.0, detector="tdi") is None
+
+
 def test_advice_says_how_far_voltages_carry_and_what_each_kind_of_measurement_brings(model, truth):
     beams = [(kV, layers) for kV in (40.0, 90.0) for layers in ("", "Al:2")]
     answer = advice(twin_of(model, truth, beams))

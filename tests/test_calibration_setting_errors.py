@@ -21,7 +21,7 @@ from raytwin.calibration.setting_errors import (
 )
 from raytwin.errors import InputError
 from raytwin.generator.line.measured_flats import stray_of_setting
-from raytwin.generator.line.twin import Z95
+from raytwin.generator.line.twin import Z95, estimate_above_zero
 from raytwin.generator.predictions.predict import predict_flatfield
 
 MM, COPPER = 1059.0, filters_from_text("Cu:0.05")
@@ -175,6 +175,22 @@ def test_flats_of_two_currents_tell_the_dark_current():
     assert np.shape(found["second_moments"]) == (3, 3)
     # no dark current where darks tell it: nothing is learned of it
     assert "dark_DN_per_ms" not in setting_errors([flat(0), flat(1)], source_detector_mm=MM, dark_DN_per_ms_sd=DARK_SD)
+
+
+def test_levels_at_exposures_as_short_as_their_error_stay_above_zero(make_model_twin):
+    twin = make_model_twin((8, 8))
+    rows = [dataclasses.replace(flat(0), series=name, exposure_ms=1.0, load_mAs=0.001).as_dict()
+            for level in twin.levels for name in level.series]  # fmt: skip
+    errors = setting_errors([flat(0, ms=1.0)], source_detector_mm=MM)
+    twin = dataclasses.replace(twin, evidence={"photon_transfer": rows, "setting_errors": errors})
+    for ms in (0.3, 1.0):
+        found = predict_flatfield(twin, Setting(kV=40.0, current_mA=100.0, exposure_ms=ms, filters=COPPER)).mean_DN
+        assert 0.0 < found.low < found.value < found.high
+    # nothing but rounding where the level is many standard deviations from 0
+    found = estimate_above_zero(100.0, 2.0)
+    assert (found.low, found.high) == pytest.approx((100.0 - 2.0 * Z95, 100.0 + 2.0 * Z95), rel=1e-6)
+    # a Gaussian whose half is cut
+    assert estimate_above_zero(1e-6, 1.0).high == pytest.approx(2.2414, abs=1e-3)
 
 
 def test_evidence_of_older_twins_says_nothing_and_damaged_evidence_is_refused(make_model_twin):

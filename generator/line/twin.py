@@ -86,6 +86,19 @@ def estimate_from_sd(value: float, sd: float, *, lowest: float = -math.inf, high
     return Estimate(value=value, low=min(max(value - half, lowest), value), high=max(min(value + half, highest), value))
 
 
+def estimate_above_zero(value: float, sd: float) -> Estimate:
+    """95 % interval of what is Gaussian about `value`, above 0, and known to be above 0: the Gaussian cut there.
+
+    Ends: quantiles 0.025 and 0.975 of the part above 0; where `value` is many `sd`, those of the Gaussian itself.
+    """
+    from scipy.special import ndtr, ndtri
+
+    beyond = float(ndtr(-value / max(sd, 1e-12 * value)))
+    # from above, where the Gaussian's own tail keeps its digits
+    low, high = (value - sd * float(ndtri((1.0 - beyond) * above)) for above in (0.975, 0.025))
+    return Estimate(value=value, low=min(max(low, 0.0), value), high=high)
+
+
 def estimate_from_log_draws(logarithm: NDArray[np.float64], relative_sd: float) -> Estimate:
     """Median and 95 % interval of exp(logarithm) (draw,) times a lognormal of `relative_sd`, in the draws' unit."""
     middle = float(np.median(logarithm))

@@ -17,7 +17,7 @@ from ..line.binning import binned_pixel
 from ..line.line_limits import check_count_rate, check_limits
 from ..line.measured_flats import USUAL_STRAY, measured_flats, stray_of_flats, stray_of_noise, stray_of_setting
 from ..line.spectral_signal import OpenBeam
-from ..line.twin import Z95, Estimate, Level, SpectralPosterior, Twin, estimate_from_log_draws, estimate_from_sd
+from ..line.twin import Z95, Estimate, Level, SpectralPosterior, Twin, estimate_above_zero, estimate_from_log_draws
 from ..line.twin_spectrum import gains_differ, slope_over_gain, slope_share, spectral_model_of
 
 if TYPE_CHECKING:
@@ -459,7 +459,7 @@ def _as_measured(
         of_setting, of_noise = stray_of_setting(twin, setting, level, distance_mm=distance_mm, signal_DN=value)
         relative = math.hypot(rate.sd / rate.value, stray_of_flats(twin), of_setting)
         more_noise = _beyond(of_noise, of_setting)
-        mean_DN, gain_DN = estimate_from_sd(value, relative * value), level.gain_DN
+        mean_DN, gain_DN = estimate_above_zero(value, relative * value), level.gain_DN
         outside = _outside(twin, setting, mean_DN.value)
     elif modelled is not None:
         mean_DN, gain_DN, outside = modelled.mean_DN, modelled.gain_DN, modelled.outside

@@ -39,6 +39,11 @@ _WEIGHINGS = 5  # of the variance law: weights follow the fitted variances
 _KEPT_PIXELS = 4096  # for the noise of a pixel and the chance of equal numbers
 
 
+_RASTER_PIXELS = 2**20  # looked at for the length of rows: correlations to a thousandth
+_SHORTEST_ROW_PX = 8
+_BY_CHANCE = 6.0  # standard deviations of a correlation: one in 1e9, for there are hundreds of lengths
+
+
 class SceneChange(enum.StrEnum):
     """How frames of one series differ beyond noise, drift and flicker."""
 
@@ -512,3 +517,33 @@ def _two_sided_limit(probability: float) -> float:
     from scipy.special import ndtri
 
     return float(-ndtri(0.5 * probability))
+
+
+def row_length_shown(first: NDArray[Any], second: NDArray[Any]) -> int | None:
+    """Row length (px) that two frames (row, column) of one flat show, where it is not theirs; None: theirs, or not told.
+
+    Neighbours share light, those above and below as those beside. In the order of the file their noise then repeats after one row,
+    and one pixel before and after that. Electronics that repeat along a row do not do the latter.
+    """
+    rows, columns = first.shape
+    kept = max(min(rows, _RASTER_PIXELS // columns), 2)
+    change = second[:kept].astype(np.float64) - first[:kept]
+    # lines that the readout moves as a whole say nothing of light
+    change -= np.median(change, axis=1, keepdims=True)
+    change -= np.median(change, axis=0)
+    largest = 4.0 * 1.4826 * float(np.median(np.abs(change)))
+    noise = np.clip(change, -largest, largest).ravel()
+    whole = float(noise @ noise)
+    if whole <= 0.0:
+        return None
+
+    def correlation(lag: int) -> float:
+        return float(noise[lag:] @ noise[:-lag]) / whole * noise.size / (noise.size - lag)
+
+    chance = _BY_CHANCE * math.sqrt(2.0 / noise.size)
+    lengths = [n for n in range(_SHORTEST_ROW_PX, noise.size // 2) if first.size % n == 0 and n != columns]
+    length = max(lengths, key=correlation, default=columns)
+    there = correlation(length)
+    beside = [correlation(length - 1), correlation(length + 1)]
+    told = min(beside) > chance and there > max(beside) and correlation(columns) < 0.5 * there
+    return length if told else None

@@ -30,7 +30,7 @@ from .common_noise import common_variance
 from .dark_frames import DarkFrames, dark_estimate, dark_map_sd, read_variance_map, sum_darks
 from .flat_evidence import flat_evidence, session_evidence
 from .flat_levels import SeriesPoint, gain_map_of, levels_of, series_points, with_noise_of_others
-from .frame_checks import repeated_frame_indices, same_scene, with_median_at
+from .frame_checks import repeated_frame_indices, row_length_shown, same_scene, with_median_at
 from .frame_sums import PIECE_BYTES, sum_frames
 from .full_scale import full_scale_reached, reaches, top_of_range
 from .interpolated_pixels import find_interpolated
@@ -111,6 +111,7 @@ def compute_photon_transfer(
             darks = DarkFrames.taken_off(session.shape, darks if session.darks else None)
         tell("flats")
         flats = _sum_flats(session, darks, sums_of, repeated=acquisition.series if repeated is None else repeated)
+        _check_rows(flats)
         noise = fit_flat_noise(
             acquisition, flats.in_use, flats.pairs, flats.others, darks, flats.good, estimator=estimator, tell=tell
         )
@@ -368,6 +369,28 @@ def _check_one_beam(levels: Sequence[tuple[Series, float]]) -> None:
                 expected="one beam, whose signal is proportional to current or power, and to exposure",
                 remedy="state the kV of every flat: those of several voltages have gains of their own",
             )
+
+
+def _check_rows(flats: _Flats) -> None:
+    """Refuse frames whose rows are of another length than the file has.
+
+    Raises:
+        InputError: the brightest flat's noise repeats after another length.
+    """
+    repeated = [(item, total) for item, total in flats.in_use if total.frames > 1]
+    if not repeated:
+        return
+    item, _ = max(repeated, key=lambda one: float(np.median(one[1].mean_DN)))
+    frames = (frame for piece in item.iter_frames(maximum_bytes=PIECE_BYTES) for frame in piece)
+    length = row_length_shown(next(frames), next(frames))
+    if length is not None:
+        rows, columns = item.shape
+        raise InputError(
+            f"series {item.name}",
+            received=f"{rows} rows of {columns} px, where pixels share light with those {length} px on",
+            expected=f"{rows * columns // length} rows of {length} px",
+            remedy="exchange or correct rows and columns where the frames were imported",
+        )
 
 
 def _mark_interpolated(bad: NDArray[np.uint8], series: Sequence[Series]) -> list[str]:

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from raytwin.calibration.frame_checks import SceneChange, growth_of_noise, repeated_frame_indices, same_scene
+from raytwin.calibration.frame_checks import (
+    SceneChange,
+    growth_of_noise,
+    repeated_frame_indices,
+    row_length_shown,
+    same_scene,
+)
 
 WALNUT = Path(__file__).parents[2] / "shared" / "realdata" / "flexray_walnut"
 DARK_DN = 300.0
@@ -41,6 +47,20 @@ def test_copies_are_found_wherever_they_stand_and_in_whatever_pieces():
     assert repeated_frame_indices([series]) == (3, 4, 8)
     assert repeated_frame_indices([series[:4], series[4:5], series[5:]]) == (3, 4, 8)
     assert repeated_frame_indices([frames]) == ()
+
+
+def test_rows_of_another_length_are_told_by_the_light_that_neighbours_share():
+    rng = np.random.default_rng(5)
+    first, second = flats(np.full((48, 64), 9000.0), 2, rng=rng, lines_DN=30.0, shape=0.01)
+    assert row_length_shown(first, second) is None
+    assert row_length_shown(first.reshape(64, 48), second.reshape(64, 48)) == 64
+    assert row_length_shown(first.reshape(96, 32), second.reshape(96, 32)) == 64
+    # lines that share light along themselves alone, whose readout repeats every 16 pixels; noise that nobody shares
+    taps = np.tile(60.0 * rng.standard_normal((2, 48, 16)), (1, 1, 4))
+    along = taps + gaussian_filter(100.0 * rng.standard_normal((2, 48, 64)), (0.0, 0.0, 0.8))
+    assert row_length_shown(*along) is None
+    assert row_length_shown(*rng.standard_normal((2, 48, 64))) is None
+    assert row_length_shown(*np.zeros((2, 48, 64))) is None
 
 
 def test_saturated_frames_with_a_few_dead_pixels_are_no_copies():

@@ -538,7 +538,8 @@ def row_length_shown(first: NDArray[Any], second: NDArray[Any]) -> int | None:
         return None
 
     def correlation(lag: int) -> float:
-        return float(noise[lag:] @ noise[:-lag]) / whole * noise.size / (noise.size - lag)
+        shared: float = float(noise[lag:] @ noise[:-lag])
+        return shared / whole * float(noise.size / (noise.size - lag))
 
     chance = _BY_CHANCE * math.sqrt(2.0 / noise.size)
     lengths = [n for n in range(_SHORTEST_ROW_PX, noise.size // 2) if first.size % n == 0 and n != columns]

@@ -210,7 +210,7 @@ _DISCREPANCIES = {
 }
 _OUTPUT = "log_output"
 _WEDGE = "wedge_log_thickness:"
-_WEDGE_DEPARTS = 2.5  # prior standard deviations: one wedge in 80 departs so far
+_WEDGE_DEPARTS = 2.5  # standard deviations: one wedge in 80 departs so far
 _THICKER = 0.01  # relative, of the derivative by a wedge's thickness
 # standard deviations of the prior from which on the output is looked at, and of prior and data from which on it is not believed:
 # Gaussian, 3 in 1000 lines with right labels have it
@@ -605,10 +605,18 @@ def wedge_thickness_name(wedge: str) -> str:
 
 
 def wedges_depart(fit: SpectralFit) -> bool:
-    """Whether a wedge is thicker or thinner than stated by more than `_WEDGE_DEPARTS` standard deviations of what wedges are."""
+    """Whether a wedge is thicker or thinner than stated by `_WEDGE_DEPARTS` standard deviations of what data that agree would find.
+
+    Data that agree with a prior move a mean by a Gaussian of the variance that they take from it; draws add theirs.
+    """
     posterior = fit.posterior
-    off = [abs(float(np.mean(posterior.column(name)))) for name in posterior.names if name.startswith(_WEDGE)]
-    return max(off, default=0.0) > _WEDGE_DEPARTS * WEDGE_THICKNESS.sd
+    for name in (name for name in posterior.names if name.startswith(_WEDGE)):
+        draws = posterior.column(name)
+        taken = max(WEDGE_THICKNESS.sd**2 - float(np.var(draws)), 0.0)
+        usual = math.sqrt(taken + WEDGE_THICKNESS.sd**2 / fit.effective_draws)
+        if abs(float(np.mean(draws))) > _WEDGE_DEPARTS * usual:
+            return True
+    return False
 
 
 def _level_data(

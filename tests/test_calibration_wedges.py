@@ -267,6 +267,14 @@ def test_a_wedge_that_says_nothing_is_left_out_with_the_reason(tmp_path, line, m
     assert message in found.skipped
 
 
+def test_a_wedge_far_thinner_than_wedges_are_is_left_out_with_a_warning(tmp_path, line):
+    path = session(tmp_path / "wrong.h5", line, stated=(1.3 * steps_map()).astype(np.float32))
+    with open_acquisition(path) as acquisition:
+        twin = calibrate_twin(acquisition, rng=np.random.default_rng(0), advise=False)
+    assert any("wedges contradict the flats" in text for text in twin.warnings)
+    assert transmissions_of_evidence(twin) == ()
+
+
 @pytest.mark.slow
 def test_wedges_with_scatter_are_left_out_with_a_warning(tmp_path, line):
     # twice the thickness is stated: what scatter does to a thick step, too much signal behind it

@@ -78,6 +78,7 @@ from .priors import (
 _ROUND_DRAWS = 1024
 _FINAL_DRAWS = 2048
 _ROUNDS = 12
+_FARTHEST = 6.0  # prior standard deviations at which derivatives are taken: Gaussian, one parameter in 5e8 lies beyond
 _KEPT = 512
 _LEAST_EFFECTIVE = 200.0  # draws that must count, or walkers go on
 _WALKERS = 1024
@@ -930,9 +931,12 @@ class _Posterior:
         return lower, np.einsum("ndk,nd->nk", weighted, misfit)
 
     def relinearise(self, u: NDArray[np.float64], weight: NDArray[np.float64], rng: np.random.Generator) -> None:
-        """Take derivatives from now on where draws (draw, dimension) of these weights (draw,) put the linear parameters."""
+        """Take derivatives from now on where draws (draw, dimension) of these weights (draw,) put the linear parameters.
+
+        Data that contradict each other would put them where no tube or detector is, and the model has no numbers.
+        """
         chosen = u[_resampled(weight, _LINEARISED_ABOUT, rng)]
-        self.about = self._conditional(chosen)[1].mean(axis=0)
+        self.about = np.clip(self._conditional(chosen)[1].mean(axis=0), -_FARTHEST, _FARTHEST)
 
     def _log_likelihood_of_repeats(self, level_sd: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log likelihood (draw,) of the scatter between repeats of a setting, whatever its level: y ~ N(m, s^2 + sd^2)."""

@@ -3,6 +3,7 @@
 import math
 from copy import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -644,3 +645,11 @@ def test_a_cover_that_nobody_declares_widens_the_dose_and_one_declared_does_not(
         assert low < truth < high
         width[declared] = math.log(high / low)
     assert width[cover] < 0.9 * width[None]
+
+
+@pytest.mark.parametrize(("wanted", "taken"), [(-200.0, -6.0), (3.0, 3.0), (40.0, 6.0)])
+def test_derivatives_are_taken_no_farther_than_where_the_model_has_numbers(wanted, taken):
+    posterior = SimpleNamespace(about=np.zeros(2), _conditional=lambda u: (None, np.full((len(u), 2), wanted)))
+    draws, weight = np.zeros((8, 3)), np.full(8, 0.125)
+    spectral_fit._Posterior.relinearise(posterior, draws, weight, np.random.default_rng(0))
+    np.testing.assert_array_equal(posterior.about, [taken, taken])

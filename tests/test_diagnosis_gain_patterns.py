@@ -6,9 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from raytwin.diagnosis.model.changes import catalogue_variants, with_seams
 from raytwin.diagnosis.probes.fixed_pattern import pattern_statistics, shares_of_pixels, shares_of_tiles
 from raytwin.diagnosis.probes.map_probes import MapProjection, Template
-from raytwin.diagnosis.probes.tile_seams import seams_in
+from raytwin.diagnosis.probes.tile_seams import SeenSeams, seams_in
 from raytwin.diagnosis.problem.nuisance_columns import changed_tiles
 from raytwin.generator.effects import EFFECTS
 from raytwin.generator.frames.defects import gain_pattern, tile_gain
@@ -162,5 +163,18 @@ def test_a_pattern_or_a_lone_stretch_of_pixels_has_no_seams(pattern):
 
 
 def test_no_flat_shows_no_seams_and_an_even_one_neither():
-    assert not seams_in([], [], GOOD).any
+    assert seams_in([], [], GOOD) is None
     assert not seams_in([np.zeros(SHAPE)], [1.0], GOOD).any
+
+
+def test_gains_of_tiles_are_tried_where_seams_are_and_not_told_where_no_flat_can_show_them():
+    other, tiles = (next(one for one in catalogue_variants() if one.effect == name) for name in ("heel", "tile_gain"))
+    seen = SeenSeams(rows=NONE, columns=Seams(side_px=48.0, first_px=10.0), log_prior=-8.0)
+    kept, found = with_seams([other, tiles], seen)
+    assert kept is other and found.log_prior == -8.0
+    places = {"rows_px": 0.0, "first_rows_px": 0.0, "columns_px": 48.0, "first_columns_px": 10.0}
+    assert {name: found.parameters[name] for name in places} == places
+    assert with_seams([other, tiles], replace(seen, columns=NONE)) == [other]
+    # one tile as large as the panel: nothing responds, and the answer says so
+    _, whole = with_seams([other, tiles], None)
+    assert (whole.parameters["rows_px"], whole.parameters["columns_px"]) == (0.0, 0.0)

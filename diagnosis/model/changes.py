@@ -325,19 +325,25 @@ def with_pauses(variants: Sequence[Variant], *, stated: bool) -> list[Variant]:
     return result
 
 
-def with_seams(variants: Sequence[Variant], seen: SeenSeams) -> list[Variant]:
-    """The variants for a session whose later flats show these seams, where tiles meet."""
-    places = {
-        f"{start}{axis}_px": value
-        for axis, seams in (("rows", seen.rows), ("columns", seen.columns))
-        for start, value in (("", seams.side_px), ("first_", seams.first_px))
-    }
-    return [
-        replace(variant, parameters={**variant.parameters, **places}, log_prior=seen.log_prior)
-        if EFFECTS[variant.effect].variation.random == "tiles"
-        else variant
-        for variant in variants
-    ]
+def with_seams(variants: Sequence[Variant], seen: SeenSeams | None) -> list[Variant]:
+    """The variants for a session whose later flats show these seams, where tiles meet; None: no flat can show any.
+
+    Without seams there are no gains of tiles.
+    """
+    result = []
+    for variant in variants:
+        if EFFECTS[variant.effect].variation.random != "tiles":
+            result.append(variant)
+        elif seen is None:
+            result.append(replace(variant, parameters={**variant.parameters, "rows_px": 0.0, "columns_px": 0.0}))
+        elif seen.any:
+            places = {
+                f"{start}{axis}_px": value
+                for axis, seams in (("rows", seen.rows), ("columns", seen.columns))
+                for start, value in (("", seams.side_px), ("first_", seams.first_px))
+            }
+            result.append(replace(variant, parameters={**variant.parameters, **places}, log_prior=seen.log_prior))
+    return result
 
 
 def _with_tried(variant: Variant, item: Parameter, value: float) -> Variant:

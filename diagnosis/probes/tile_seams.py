@@ -36,8 +36,10 @@ class SeenSeams:
         return self.rows.side_px > 0.0 or self.columns.side_px > 0.0
 
 
-def seams_in(changes: Sequence[NDArray[np.floating]], weights: Sequence[float], clean: NDArray[np.bool_]) -> SeenSeams:
-    """The seams that relative changes of flats (row, column) show, those of all together; none where there is no flat.
+def seams_in(
+    changes: Sequence[NDArray[np.floating]], weights: Sequence[float], clean: NDArray[np.bool_]
+) -> SeenSeams | None:
+    """The seams that relative changes of flats (row, column) show, those of all together; None: there is no flat.
 
     Args:
         changes: measured over expected, less 1, of each flat.
@@ -45,7 +47,7 @@ def seams_in(changes: Sequence[NDArray[np.floating]], weights: Sequence[float], 
         clean: pixels in use that do not stand out (row, column).
     """
     if not changes:
-        return SeenSeams(rows=Seams(), columns=Seams(), log_prior=0.0)
+        return None
     change = np.average(np.stack([np.asarray(one, dtype=np.float64) for one in changes]), axis=0, weights=weights)
     columns, tried_columns = _along(change, clean)
     rows, tried_rows = _along(change.T, clean.T)

@@ -178,8 +178,8 @@ class _Measured:
     outliers: int
     skipped: tuple[str, ...]
 
-    def seams(self) -> SeenSeams:
-        """Where flats that came after calibration show that tiles meet."""
+    def seams(self) -> SeenSeams | None:
+        """Where flats that came after calibration show that tiles meet; None: there is none."""
         changes, weights = [], []
         for one in self.expected.series:
             if one.session.series.kind == "flat" and not one.session.calibrates:

@@ -11,6 +11,7 @@ from raytwin.diagnosis.probes.fixed_pattern import pattern_statistics, shares_of
 from raytwin.diagnosis.probes.map_probes import MapProjection, Template
 from raytwin.diagnosis.probes.tile_seams import SeenSeams, seams_in
 from raytwin.diagnosis.problem.nuisance_columns import changed_tiles
+from raytwin.errors import InputError
 from raytwin.generator.effects import EFFECTS
 from raytwin.generator.frames.defects import gain_pattern, tile_gain
 from raytwin.generator.line.line_state import FixedPattern, LineState, Seams, TilePattern
@@ -136,6 +137,8 @@ def test_the_effect_of_tiles_draws_them_where_its_parameters_say():
     assert effect.change(lit, values, SimpleNamespace(since="always")) is lit
     found = effect.change(lit, values, SimpleNamespace(since="calibration")).tile_pattern
     assert found == TilePattern(rms=0.005, rows=NONE, columns=Seams(side_px=48.0, first_px=10.0), seed=0)
+    with pytest.raises(InputError, match="rows_px of tile_gain: got -5"):
+        effect.change(lit, {**values, "rows_px": -5.0}, SimpleNamespace(since="calibration"))
     gain = tile_gain(found, SHAPE)
     assert gain.mean() == pytest.approx(1.0, abs=1e-12) and np.ptp(gain, axis=0).max() == 0.0
     np.testing.assert_array_equal(np.flatnonzero(np.diff(gain[0])) + 1, [10, 58, 106])

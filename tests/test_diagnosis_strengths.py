@@ -85,9 +85,10 @@ def test_too_few_series_or_nothing_but_noise_leave_the_fit_its_strength():
     assert found([view(np.zeros(FRAMES), noise_DN=40.0) for _ in range(8)]) is None
 
 
-def flats(change, *, noise=0.002, count=3, seed=0):
-    """Later flats (row, column) whose gains have changed by a relative map, and one that calibrated."""
+def flats(change, *, noise=0.002, expected=None, count=3, seed=0):
+    """Later flats (row, column) whose gains have changed by a relative map, and one that calibrated; expected: noise by the twin."""
     rng = np.random.default_rng(seed)
+    expected = noise if expected is None else expected
 
     def one(added, *, calibrates=False):
         residual = SIGNAL_DN * (added + noise * rng.standard_normal(change.shape))
@@ -96,7 +97,13 @@ def flats(change, *, noise=0.002, count=3, seed=0):
             mask=np.ones(change.shape, dtype=bool),
             signal_DN=np.full(change.shape, SIGNAL_DN),
             residual_DN=residual,
-            noise_DN=np.full(change.shape, noise * SIGNAL_DN),
+            noise_DN=np.full(change.shape, expected * SIGNAL_DN),
+            summary=SimpleNamespace(
+                frames=10, pair_variance_DN2=np.full(change.shape, 10.0 * (noise * SIGNAL_DN) ** 2)
+            ),
+            expected=SimpleNamespace(
+                quantum_variance_DN2=10.0 * (expected * SIGNAL_DN) ** 2, white_variance_DN2=np.zeros((1, 1))
+            ),
         )
 
     return [one(0.0, calibrates=True), *(one(change) for _ in range(count))]
@@ -120,6 +127,12 @@ def test_the_strength_of_a_changed_gain_map_is_its_rms_whatever_its_structure(pa
     change = 0.006 * (change - change.mean()) / change.std()
     value, low, high = map_rms(flats(change))
     assert value == pytest.approx(0.6, rel=0.02) and low < 0.6 < high < 0.65
+
+
+def test_noise_that_the_twin_does_not_expect_is_no_pattern():
+    change = 0.002 * np.random.default_rng(1).standard_normal((96, 96))
+    value, low, high = map_rms(flats(change, noise=0.008, expected=0.006, count=6))
+    assert low < 0.2 < high and value == pytest.approx(0.2, rel=0.2)
 
 
 def test_noise_alone_and_a_second_effect_of_the_same_maps_give_no_strength():

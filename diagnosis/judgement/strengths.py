@@ -154,8 +154,9 @@ def _output_rms(problem: Problem, hypothesis: Hypothesis, output: str) -> tuple[
 def _map_rms(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:
     """Rms over the pixels, %, of what later flats have changed by, whatever its structure, and its 95 % interval.
 
-    What other effects change is subtracted, and counts as far as laws of their kind are off. None: there is no later flat, another
-    effect is read from the same maps, or noise and the usual change of a flat's shape would leave as much.
+    Noise of the frames is as they show it, that of calibration as the twin has it. What other effects change is subtracted, and
+    counts as far as laws of their kind are off. None: there is no later flat, another effect is read from the same maps, or noise
+    and the usual change of a flat's shape would leave as much.
     """
     others = [one for one in hypothesis.effects if one != effect]
     later = [
@@ -177,16 +178,23 @@ def _map_rms(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[flo
             moved = maps[number] / signal
             left = left - moved
             off += (EFFECTS[one].reading.law_sd * float(np.std(np.broadcast_to(moved, mask.shape)[mask]))) ** 2
-        noise = mean_over((view.noise_DN / signal) ** 2, mask)
         seen = float(np.var(left[mask]))
-        variances.append(seen - noise)
+        variances.append(seen - mean_over(_noise_variance(view) / signal**2, mask))
         sds.append(math.hypot(off, seen * math.sqrt(2.0 / np.count_nonzero(mask))))
-    # one pattern stands in all of them
-    value, sd = float(np.mean(variances)), float(np.mean(sds))
+    # one pattern stands in all of them, and what may be wrong with it is the same in all
+    weights = 1.0 / np.square(sds)
+    value, sd = (float(np.average(one, weights=weights)) for one in (variances, sds))
     if value <= Z95 * sd:
         return None
     low, middle, high = (100.0 * math.sqrt(one) for one in (value - Z95 * sd, value, value + Z95 * sd))
     return middle, low, high
+
+
+def _noise_variance(view: SeriesView) -> Map:
+    """Variance (row, column), DN^2, of noise in a corrected mean frame: of its frames as they show it, of calibration as expected."""
+    expected = view.expected.quantum_variance_DN2 + view.expected.white_variance_DN2
+    shown = view.summary.pair_variance_DN2 - expected
+    return np.asarray(view.noise_DN**2 + shown / view.summary.frames, np.float32)
 
 
 def _open_field(view: SeriesView) -> NDArray[np.bool_]:

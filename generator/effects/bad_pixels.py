@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line.line_state import LineContext, LineState
-from .effect import EVERY_SERIES, Effect, Parameter, Reading, Shows
+from .effect import EVERY_SERIES, Effect, Parameter, Reading, Shows, seed_of
 
 
 def _spoil_pixels(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -44,16 +44,7 @@ BAD_PIXELS = Effect(
             source="of them, pixels that show without beam; the rest are dead",
             log=False,
         ),
-        Parameter(
-            name="pattern_seed",
-            unit="",
-            low=0.0,
-            high=2.0**31,
-            default=0.0,
-            source="draws where they are",
-            log=False,
-            fitted=False,
-        ),
+        seed_of("where they are"),
     ),
     stage="readout",
     reference="defect classes of ASTM E2597",

@@ -100,6 +100,20 @@ class Parameter:
         return share if self.pixel_power >= 0.0 else 1.0 / share
 
 
+def seed_of(what: str) -> Parameter:
+    """The parameter `pattern_seed`, which draws what an effect does to each pixel or tile: a condition of the session."""
+    return Parameter(
+        name="pattern_seed",
+        unit="",
+        low=0.0,
+        high=2.0**31,
+        default=0.0,
+        source=f"draws {what}",
+        log=False,
+        fitted=False,
+    )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shows:
     """Where an effect, or what is wrong with its law, can show.

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from ...errors import InputError
 from ..line.line_state import FixedPattern, LineContext, LineState
-from .effect import EVERY_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation
+from .effect import EVERY_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation, seed_of
 
 
 def _change_gain(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -66,16 +66,7 @@ GAIN_MAP_ERROR = Effect(
             log=False,
             fitted=False,
         ),
-        Parameter(
-            name="pattern_seed",
-            unit="",
-            low=0.0,
-            high=2.0**31,
-            default=0.0,
-            source="draws the pattern",
-            log=False,
-            fitted=False,
-        ),
+        seed_of("the pattern"),
     ),
     stage="response",
     reference="fixed-pattern noise (PRNU), EMVA Standard 1288, release 4.0",

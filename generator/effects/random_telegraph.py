@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from ...errors import InputError
 from ..line.line_state import LineContext, LineState, TelegraphPixels
-from .effect import EVERY_SERIES, Effect, Grid, Parameter, Reading, Shows
+from .effect import EVERY_SERIES, Effect, Grid, Parameter, Reading, Shows, seed_of
 
 
 def _let_pixels_jump(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -81,16 +81,7 @@ RANDOM_TELEGRAPH = Effect(
             source="ratio of largest to smallest height and of longest to shortest stay: traps lie at all depths and distances",
             log=True,
         ),
-        Parameter(
-            name="pattern_seed",
-            unit="",
-            low=0.0,
-            high=2.0**31,
-            default=0.0,
-            source="draws where they are",
-            log=False,
-            fitted=False,
-        ),
+        seed_of("where they are"),
     ),
     stage="readout",
     reference="Hopkins, Hopkinson, IEEE Trans. Nucl. Sci. 40 (1993) 1567-1574; two levels",

@@ -6,14 +6,22 @@ y = x (1 + eta_tile), eta fixed from frame to frame; channels are tiles over who
 from collections.abc import Mapping
 from dataclasses import replace
 
+from ...errors import InputError
 from ..line.line_state import LineContext, LineState, TilePattern
-from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation
+from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation, seed_of
 
 
 def _change_tiles(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
     # gains that calibration saw are in its maps
     if parameters["strength"] == 0 or context.since == "always":
         return state
+    for name in ("rows_px", "columns_px"):
+        if 0.0 != parameters[name] < 1.0:
+            raise InputError(
+                f"{name} of tile_gain",
+                received=parameters[name],
+                expected="1 px or more, or 0 of tiles as long as the panel",
+            )
     return replace(state, tile_pattern=TilePattern.of(parameters, rms=parameters["strength"] / 100.0))
 
 
@@ -54,16 +62,7 @@ TILE_GAIN = Effect(
         _lines("columns_px", 32.0, _SIDE),
         _lines("first_rows_px", 0.0, _FIRST),
         _lines("first_columns_px", 0.0, _FIRST),
-        Parameter(
-            name="pattern_seed",
-            unit="",
-            low=0.0,
-            high=2.0**31,
-            default=0.0,
-            source="draws the gains",
-            log=False,
-            fitted=False,
-        ),
+        seed_of("the gains"),
     ),
     stage="response",
     reference="gains of readout chips beside each other: spatial nonuniformity, EMVA Standard 1288, release 4.0",

@@ -115,7 +115,7 @@ class Seams:
         """Number of the tile that each of `length` pixels in line lies in (pixel,)."""
         if self.side_px <= 0.0:
             return np.zeros(length, dtype=np.intp)
-        number = np.floor((np.arange(length) + 0.5 - self.first_px) / max(self.side_px, 1.0)).astype(np.intp)
+        number = np.floor((np.arange(length) + 0.5 - self.first_px) / self.side_px).astype(np.intp)
         return np.asarray(number - number[0])
 
 

@@ -5,14 +5,16 @@ from types import SimpleNamespace
 
 import pytest
 
+from raytwin.calibration.priors import PRIORS
 from raytwin.checks.findings import Finding, FindingCode
 from raytwin.diagnosis.diagnose_session import _with_findings
 from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, title_of
 from raytwin.diagnosis.judgement.answer import Cause, Diagnosis, Place
 from raytwin.diagnosis.judgement.held_out import Gap
 from raytwin.diagnosis.judgement.judgement import verdict_of
-from raytwin.diagnosis.report.explanation import location_text, paragraph, share_text
-from raytwin.diagnosis.report.report import headline, lead_text, next_steps
+from raytwin.diagnosis.report.explanation import answer_text, headline, lead_text, strained_text, verdict_text
+from raytwin.diagnosis.report.report import next_steps
+from raytwin.diagnosis.report.words import location_text, nuisance_text, share_text, statistic_text
 
 
 def place(axis, series, z, *, statistic="mean frame", location=""):
@@ -76,8 +78,45 @@ def test_a_location_is_words_that_a_reader_knows(location, words):
     assert location_text(location) == words
 
 
+@pytest.mark.parametrize(
+    ("statistic", "words"),
+    [
+        ("mean frame", ""),
+        ("log_variance dark third", "variance of the noise, dark third"),
+        ("correlation field (1,-1)", "correlation of the noise 1 rows and -1 columns apart, field"),
+        ("afterglow frames 0-0", "frame 0 after the beam"),
+        ("afterglow frames 3-4", "frames 3 to 4 after the beam"),
+        ("fixed_pattern columns", "fixed pattern of columns"),
+    ],
+)
+def test_a_statistic_is_words_that_a_reader_knows(statistic, words):
+    assert statistic_text(statistic) == words
+
+
+def test_every_parameter_of_a_spectrum_has_words_and_a_kind_of_nuisance_is_told_once():
+    assert not [name for name in PRIORS if nuisance_text(name) == name]
+    far = (("shape 4 of discs", -14.0), ("shape 2 of discs", 9.0), ("log_mu_Al", -8.0), ("kV_tilt", 6.0), ("x", 5.0))
+    text = strained_text(diagnosis("unknown_effect", strained=far))
+    shown = "slow change of the field in discs (-14 sd), attenuation of Al (-8 sd), tube voltage (+6 sd) and 1 more"
+    assert text.startswith(f"Far from what is known of it: {shown}.")
+
+
+def test_the_printed_answer_is_a_headline_a_table_and_a_sentence_a_line():
+    found = cause("object_scatter", 0.94, (12.3, 9.9, 14.8))
+    lines = answer_text(
+        diagnosis("explained", causes=(found,), named=("object_scatter",), notes=("three series moved",))
+    ).splitlines()
+    assert lines[0] == "Radiation scattered by the object, 12.3 % (9.9 to 14.8)"
+    assert lines[1] == "It is explained by:"
+    assert lines[2].split("  ")[0] == "effect"
+    assert lines[3].endswith("0.94         12.3 % (9.9 to 14.8)  always there  80 %")
+    assert lines[4] == "The gap shows in brightness, pattern across the field and noise texture."
+    assert lines[-2].endswith("by 82 % (75 to 90) of what is above noise.")
+    assert lines[-1] == "Three series moved."
+
+
 def test_an_unknown_effect_has_its_place_and_signature_in_words():
-    text = paragraph(diagnosis("unknown_effect"))
+    text = verdict_text(diagnosis("unknown_effect"))
     assert "No effect of the catalogue, and no pair of them, explains it (probability 0.91" in text
     assert "It is seen most in the pattern across the field of flats." in text
     # the largest of each kind of series and axis, largest first
@@ -98,26 +137,26 @@ def test_an_unknown_effect_has_its_place_and_signature_in_words():
     ],
 )
 def test_the_place_of_an_unknown_effect_names_scenes_and_kinds(location, words):
-    assert f"It is seen most in the {words}." in paragraph(diagnosis("unknown_effect", unknown_location=location))
+    assert f"It is seen most in the {words}." in verdict_text(diagnosis("unknown_effect", unknown_location=location))
 
 
 def test_an_explanation_states_strength_interval_probability_and_what_is_left():
     found = cause("object_scatter", 0.94, (12.3, 9.9, 14.8))
-    text = paragraph(diagnosis("explained", causes=(found,), named=("object_scatter",)))
+    text = verdict_text(diagnosis("explained", causes=(found,), named=("object_scatter",)))
     assert "12.3 % (9.9 to 14.8), probability 0.94" in text
     assert "falls to 1.20 once that is added, by 82 % (75 to 90) of what is above noise" in text
     # what is left may lie below the floor by chance; no gap shrinks by more than itself
     beyond = Gap(before=3.0, after=0.78, floor=0.8, shrinks_by=(1.01, 0.97, 1.04))
-    text = paragraph(diagnosis("explained", causes=(found,), named=("object_scatter",), gap=beyond))
+    text = verdict_text(diagnosis("explained", causes=(found,), named=("object_scatter",), gap=beyond))
     assert "falls to 0.78 once that is added, by 100 % (97 to 100) of what is above noise" in text
     lower = cause("kv_error", 0.9, (-2.0, -2.5, -1.5))
-    assert "-2.00 % (-2.50 to -1.50)" in paragraph(diagnosis("explained", causes=(lower,), named=("kv_error",)))
+    assert "-2.00 % (-2.50 to -1.50)" in verdict_text(diagnosis("explained", causes=(lower,), named=("kv_error",)))
 
 
 def test_what_leaves_most_of_the_gap_is_no_explanation():
     found = cause("row_noise", 0.9, (0.9, 0.7, 1.2))
     wider = Gap(before=7.4, after=8.3, floor=0.8, shrinks_by=(-0.14, -0.77, 0.69))
-    text = paragraph(diagnosis("explained_in_part", causes=(found,), named=("row_noise",), gap=wider))
+    text = verdict_text(diagnosis("explained_in_part", causes=(found,), named=("row_noise",), gap=wider))
     assert "Of the catalogue it is most like: noise common to rows" in text
     assert "does not fall (8.30) once that is added." in text
     assert "explained by" not in text
@@ -135,7 +174,7 @@ def test_an_effect_is_observed_in_its_probes_where_the_gap_over_all_was_at_its_f
     found = cause("focal_spot", 0.99, (0.7, 0.53, 0.9), unit="mm")
     floor = Gap(before=0.71, after=0.70, floor=0.73, shrinks_by=None)
     seen = diagnosis("explained", causes=(found,), named=("focal_spot",), gap=floor, added=("focal_spot",))
-    text = paragraph(seen)
+    text = verdict_text(seen)
     assert "explained" not in text
     assert "Observed there: focal spot larger than assumed, 0.700 mm (0.530 to 0.900)" in text
     assert "over all probes at its floor of 0.73 already, and 0.70 once that is added." in text
@@ -214,7 +253,7 @@ def test_a_tie_names_its_members_and_the_measurement_that_would_break_it():
         Hypothesis(effects=effects, probability=probability, log_evidence=0.0)
         for effects, probability in ((("image_lag", "dark_drift"), 0.5), ((UNKNOWN,), 0.4), ((), 0.1))
     ]
-    text = paragraph(diagnosis("ambiguous", hypotheses=tied, next_measurement={"text": "take beam-off frames"}))
+    text = verdict_text(diagnosis("ambiguous", hypotheses=tied, next_measurement={"text": "take beam-off frames"}))
     both = f"{title_of('image_lag')} with {title_of('dark_drift')} (0.50)"
     assert (
         f"cannot distinguish between {both}, an effect that is not in the catalogue (0.40), no effect (0.10)." in text
@@ -223,12 +262,15 @@ def test_a_tie_names_its_members_and_the_measurement_that_would_break_it():
 
 
 def test_no_gap_says_how_sure_it_is_and_wrong_labels_come_before_everything():
-    assert "probability 0.87 that nothing is missing" in paragraph(diagnosis("no_gap", probability_no_gap=0.87))
+    assert "probability 0.87 that nothing is missing" in verdict_text(diagnosis("no_gap", probability_no_gap=0.87))
     wrong = Finding(code=FindingCode.LABEL, series="flat_1", values={"what": "looks like 60 kV (labelled 90 kV)"})
-    text = paragraph(
+    text = answer_text(
         diagnosis(
             "unknown_effect", findings=(wrong,), no_gap_but_findings=True, probability_no_gap=0.87, warnings=("flat_1",)
         )
     )
-    assert text.startswith("Labels look wrong: flat_1: looks like 60 kV (labelled 90 kV)")
+    assert text.splitlines()[:2] == [
+        "Labels look wrong",
+        "flat_1: looks like 60 kV (labelled 90 kV): correct the label, or leave the series out",
+    ]
     assert "The other series agree with the twin (probability 0.87 that nothing is missing in them)" in text

@@ -1,7 +1,8 @@
 """The answer in words and pictures.
 
 Files:
-    explanation   one paragraph
+    words         of probes, nuisances, strengths
+    explanation   a headline, a table, a sentence for each thing to be said
     figures       gap maps, curves, hypotheses
     report        the page
 """

@@ -1,98 +1,58 @@
-"""The diagnosis in plain words: one paragraph that can be read once."""
+"""The diagnosis in plain words: a headline, a table of causes, and a sentence for each thing that is to be said."""
 
-import math
 from collections.abc import Sequence
 
 from ...checks.findings import FindingCode
 from ...generator.effects import EFFECTS
+from ...results import Table
 from ..inference.inference import title_of
-from ..judgement.answer import EXPLAINED, Cause, Diagnosis, Place
+from ..judgement.answer import EXPLAINED, Diagnosis, Place
 from ..judgement.held_out import Gap
+from .words import axis_text, family_text, nuisance_text, place_text, share_text, strength_text, when_text
 
-# so many of a kind fit into a paragraph
+# so many of a kind fit into a sentence
 _NAMED = 3
 _NAMED_UNTESTED = 8  # names alone are shorter
 _NAMED_FAMILIES = 4
 _RIVALS, _LEAST_LIKELY = 5, 0.05  # explanations that are named where none leads
 _MOSTLY = 0.5  # of the gap above noise, from which what takes so much explains it
-_SHAPED_LIKE = "like "  # templates of what effects would do
-_KIND_WORDS = {"flat": "flats", "dark": "darks", "object": "objects", "afterglow": "frames after the beam"}
-_AXIS_WORDS = {
-    "level": "brightness",
-    "noise": "noise",
-    "sharpness": "sharpness at edges",
-    "texture": "noise texture",
-    "time": "change with time",
-    "position": "pattern across the field",
-    "energy": "change with tube voltage",
-    "tails": "outlying pixels and codes",
-}
 _FINDING_TITLES = {
     FindingCode.STOPS: "Numbers are cut off early",
     FindingCode.SPECTRUM: "The flats fit no spectrum",
 }
 
 
-def axis_text(axis: str) -> str:
-    """An axis of the gap in words."""
-    return _AXIS_WORDS.get(axis, axis)
-
-
 def _percent(value: tuple[float, float, float]) -> str:
     return f"{100 * value[0]:.0f} % ({100 * value[1]:.0f} to {100 * value[2]:.0f})"
 
 
-def strength_text(cause: Cause) -> str:
-    """Strength with its 95 % interval and unit."""
-    value, low, high = cause.strength
-    digits = min(max(0, 2 - math.floor(math.log10(max(abs(value), 1e-9)))), 4)
-    return f"{value:.{digits}f} {cause.unit} ({low:.{digits}f} to {high:.{digits}f})"
-
-
-def location_text(location: str) -> str:
-    """Where within a series, in words; what effects would do is called by their titles."""
-    if not location.startswith(_SHAPED_LIKE):
-        return location
-    return f"in the shape of: {title_of(location.removeprefix(_SHAPED_LIKE).split(' ')[0])}"
-
-
-def _place_text(place: Place) -> str:
-    where = location_text(place.location)
-    what = f"{place.statistic}, {where}" if where else place.statistic
-    return f"{axis_text(place.axis)} of {place.series} ({what}, z {place.z:+.1f})"
-
-
-def _family_text(axis: str, kind: str, scene: str) -> str:
-    """One axis of a kind of series, or of those of a scene."""
-    return f"{axis_text(axis)} of {scene or _KIND_WORDS.get(kind, kind)}"
-
-
-def _signature_text(diagnosis: Diagnosis) -> str:
+def _signature(diagnosis: Diagnosis) -> list[str]:
     """Where an effect outside the catalogue is seen most, and its largest departures, one a kind of series and axis."""
     series = {view.session.name: view.session.series for view in diagnosis.compared.views}
     largest: dict[str, float] = {}
     for place in diagnosis.where:
         # objects of all scenes together: a signature is not one product's
         kind = series[place.series].kind if place.series in series else ""
-        family = _family_text(place.axis, kind, "" if kind else place.series)
+        family = family_text(place.axis, kind, "" if kind else place.series)
         if abs(place.z) > abs(largest.get(family, 0.0)):
             largest[family] = place.z
-    text = ""
+    told = []
     axis, _, where = diagnosis.unknown_location.partition(" of ")
     if where:
         kind, _, scene = where.partition(" ")
-        text = f" It is seen most in the {_family_text(axis, kind, scene)}."
+        told.append(f"It is seen most in the {family_text(axis, kind, scene)}.")
     if largest:
         shown = sorted(largest.items(), key=lambda item: -abs(item[1]))[:_NAMED_FAMILIES]
-        text += f" Its signature: {'; '.join(f'{family} (z {z:+.0f})' for family, z in shown)}."
-    return text
+        told.append(f"Its signature: {'; '.join(f'{family} (z {z:+.0f})' for family, z in shown)}.")
+    return told
 
 
-def _where_text(places: Sequence[Place]) -> str:
+def _where(places: Sequence[Place]) -> list[str]:
     if not places:
-        return "No single probe stands out beyond noise and what calibration leaves open; it shows in many together."
-    axes = list(dict.fromkeys(axis_text(place.axis) for place in places[:12]))
-    return f"The gap shows in {', '.join(axes[:3])}; most clearly in the {_place_text(places[0])}."
+        return ["No single probe stands out beyond noise and what calibration leaves open; it shows in many together."]
+    axes = list(dict.fromkeys(axis_text(place.axis) for place in places[:12]))[:3]
+    listed = ", ".join(axes[:-1]) + (" and " if axes[:-1] else "") + axes[-1]
+    return [f"The gap shows in {listed}.", f"It is clearest in the {place_text(places[0])}."]
 
 
 def compared_text(diagnosis: Diagnosis) -> str:
@@ -112,11 +72,14 @@ def compared_text(diagnosis: Diagnosis) -> str:
 
 
 def strained_text(diagnosis: Diagnosis) -> str:
-    """Nuisances that the frames pull far from what is known of them; empty without any."""
-    if not diagnosis.strained:
+    """Nuisances that the frames pull far from what is known of them, the farthest of a kind each; empty without any."""
+    farthest: dict[str, float] = {}
+    for name, value in diagnosis.strained:
+        farthest.setdefault(nuisance_text(name), value)
+    if not farthest:
         return ""
-    shown = ", ".join(f"{name} ({value:+.0f} sd)" for name, value in diagnosis.strained[:_NAMED])
-    more = len(diagnosis.strained) - _NAMED
+    shown = ", ".join(f"{name} ({value:+.0f} sd)" for name, value in list(farthest.items())[:_NAMED])
+    more = len(farthest) - _NAMED
     shown += f" and {more} more" if more > 0 else ""
     return (
         f"Far from what is known of it: {shown}. A wrong map, label or position looks like that, and so may an effect that is not in"
@@ -124,66 +87,159 @@ def strained_text(diagnosis: Diagnosis) -> str:
     )
 
 
-def paragraph(diagnosis: Diagnosis) -> str:
-    """Verdict, where, which, how far; findings come first, what the session could not show comes last."""
-    text = verdict_text(diagnosis)
+def answer_text(diagnosis: Diagnosis) -> str:
+    """What `raytwin diagnose` prints: the headline, the causes as a table, and then a sentence a line."""
+    lines = [headline(diagnosis)]
     if diagnosis.findings:
-        lines = [item.line for item in diagnosis.findings]
-        shown = "; ".join(lines[:_NAMED])
-        more = f"; and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
-        text = f"{findings_title(diagnosis)}: {shown}{more}. All else is of the other series. {text}"
+        lines += [*(item.line for item in diagnosis.findings), "All else is of the other series."]
+    if _explained(diagnosis):
+        lines.append(_causes(diagnosis).as_text())
+        lines += [*_where(diagnosis.where), *_fall(diagnosis)]
+    else:
+        lines += _not_explained(diagnosis)
     if diagnosis.not_tested or diagnosis.warnings:
-        text += f" {compared_text(diagnosis)}"
+        lines.append(compared_text(diagnosis))
     if diagnosis.strained and diagnosis.verdict not in EXPLAINED:
-        text += f" {strained_text(diagnosis)}"
-    for note in diagnosis.notes:
-        text += f" {note[0].upper()}{note[1:]}."
-    return text
+        lines.append(strained_text(diagnosis))
+    return "\n".join([*lines, *(f"{_sentence(note)}." for note in diagnosis.notes)])
 
 
 def verdict_text(diagnosis: Diagnosis) -> str:
     """Where, which and how far, without what the session could not show."""
-    gap = diagnosis.gap
-    figures = f"On data the fit did not see the gap is {gap.before:.2f} (1 is noise)"
-    if diagnosis.no_gap_but_findings:
-        return (
-            f"The other series agree with the twin (probability {diagnosis.probability_no_gap:.2f} that nothing is missing in"
-            f" them). {figures}."
-        )
-    if diagnosis.verdict == "no_gap":
-        return (
-            f"The session agrees with its twin (probability {diagnosis.probability_no_gap:.2f} that nothing is missing). "
-            f"{figures}."
-        )
-    where = _where_text(diagnosis.where)
-    if diagnosis.verdict == "unknown_effect":
-        return (
-            f"{where} No effect of the catalogue, and no pair of them, explains it (probability"
-            f" {diagnosis.probability_unknown:.2f} of an effect that is not in the catalogue).{_signature_text(diagnosis)}"
-            f" {figures}."
-        )
-    if diagnosis.verdict == "ambiguous":
-        named = ", ".join(f"{title} ({probability:.2f})" for title, probability in rivals(diagnosis))
-        text = f"{where} These data cannot distinguish between {named}. {figures}."
-        if diagnosis.next_measurement:
-            text += f" To distinguish them: {diagnosis.next_measurement['text']}."
-        return text
+    if not _explained(diagnosis):
+        return " ".join(_not_explained(diagnosis))
     named = "; ".join(
         f"{title_of(cause.effect)}, {strength_text(cause)}, probability {cause.probability:.2f}"
         for cause in diagnosis.leading
     )
+    return " ".join([*_where(diagnosis.where), f"{_relation(diagnosis.gap)}: {named}.", *_fall(diagnosis)])
+
+
+def lead_text(diagnosis: Diagnosis) -> str:
+    """Where the gap is observed and what becomes of it, in two to four sentences."""
+    gap = diagnosis.gap
+    if diagnosis.findings:
+        names = {name for item in diagnosis.findings for name in item.names}
+        one = len(diagnosis.findings) == 1
+        found = diagnosis.findings[0].line if one else f"{len(names)} series contradict what they state"
+        return f"{found}. All else is of the other series. {verdict_text(diagnosis)}"
+    if not diagnosis.added or not diagnosis.where:
+        return verdict_text(diagnosis)
+    place = diagnosis.where[0]
+    told = [f"The gap is clearest in the {axis_text(place.axis)} of {place.series}."]
+    if gap.at_floor:
+        told.append(
+            f"Over all probes of series that the fit did not use, the gap was at its floor of {gap.floor:.2f} already:"
+            f" {gap.before:.2f}, and {gap.after:.2f} with what was found added to the twin."
+        )
+    else:
+        ends = f"the gap on series that the fit did not use, {gap.before:.2f} (1: noise alone), {_falls(gap)}"
+        told.append(f"With what was found added to the twin, {ends}.")
+    return " ".join([*told, *_no_better(gap), *_left(diagnosis)])
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    """The answer in one line."""
+    if diagnosis.no_gap_but_findings:
+        return findings_title(diagnosis)
+    found = _headline_of_verdict(diagnosis)
+    if not diagnosis.findings:
+        return found
+    title = findings_title(diagnosis)
+    # what makes labels look wrong may be that effect
+    return f"{found}. {title}, too" if diagnosis.verdict == "unknown_effect" else f"{title}. The other series: {found}"
+
+
+def _headline_of_verdict(diagnosis: Diagnosis) -> str:
+    """What explains the series that were compared."""
+    if diagnosis.verdict == "no_gap":
+        return "No gap: the session agrees with its twin"
+    if diagnosis.verdict == "unknown_effect":
+        return "An effect that is not in the catalogue"
+    if diagnosis.verdict == "ambiguous":
+        names = [title for title, _ in rivals(diagnosis)[:3]]
+        return _sentence(f"{' or '.join(names)}: these data cannot distinguish them")
+    named = _sentence(" and ".join(f"{title_of(cause.effect)}, {strength_text(cause)}" for cause in diagnosis.leading))
+    if not (diagnosis.gap.falls or diagnosis.gap.at_floor):
+        return f"{named}: most like it, but the gap does not fall"
+    if diagnosis.verdict == "explained":
+        return named
+    return f"{named}: {'its law leaves' if len(diagnosis.leading) == 1 else 'their laws leave'} a misfit"
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _explained(diagnosis: Diagnosis) -> bool:
+    """Whether effects are named."""
+    return diagnosis.verdict in EXPLAINED and not diagnosis.no_gap_but_findings
+
+
+def _causes(diagnosis: Diagnosis) -> Table:
+    """The causes that are named."""
+    rows = tuple(
+        (
+            title_of(cause.effect),
+            f"{cause.probability:.2f}",
+            strength_text(cause),
+            f"in {len(cause.series)} series" if cause.series else when_text(cause),
+            share_text(cause.shrinks_by) or "-",
+        )
+        for cause in diagnosis.leading
+    )
+    header = ("effect", "probability", "strength (95 %)", "when", "gap removed")
+    return Table(title=f"{_relation(diagnosis.gap)}:", header=header, rows=rows)
+
+
+def _relation(gap: Gap) -> str:
+    """What effects that are named are to the gap."""
     share = None if gap.shrinks_by is None else gap.shrinks_by[0]
     if gap.at_floor:
-        found = "Observed there"
-    elif gap.falls and (share is None or share > _MOSTLY):
-        found = "It is explained by"
-    else:
-        found = "Of the catalogue it is most like"
-    text = f"{where} {found}: {named}. {figures}{',' if gap.at_floor else ' and'} {fall_text(gap)} once that is added"
+        return "Observed there"
+    if gap.falls and (share is None or share > _MOSTLY):
+        return "It is explained by"
+    return "Of the catalogue it is most like"
+
+
+def _figures(gap: Gap) -> str:
+    return f"On data the fit did not see the gap is {gap.before:.2f} (1 is noise)"
+
+
+def _not_explained(diagnosis: Diagnosis) -> list[str]:
+    """What is found where no effect of the catalogue is named: a sentence each."""
+    figures = f"{_figures(diagnosis.gap)}."
+    if diagnosis.no_gap_but_findings or diagnosis.verdict == "no_gap":
+        who, where = "The session agrees with its twin", ""
+        if diagnosis.no_gap_but_findings:
+            who, where = "The other series agree with the twin", " in them"
+        return [f"{who} (probability {diagnosis.probability_no_gap:.2f} that nothing is missing{where}).", figures]
+    if diagnosis.verdict == "unknown_effect":
+        return [
+            *_where(diagnosis.where),
+            "No effect of the catalogue, and no pair of them, explains it (probability"
+            f" {diagnosis.probability_unknown:.2f} of an effect that is not in the catalogue).",
+            *_signature(diagnosis),
+            figures,
+        ]
+    named = ", ".join(f"{title} ({probability:.2f})" for title, probability in rivals(diagnosis))
+    measure = diagnosis.next_measurement
+    return [
+        *_where(diagnosis.where),
+        f"These data cannot distinguish between {named}.",
+        figures,
+        *([f"To distinguish them: {measure['text']}."] if measure else []),
+    ]
+
+
+def _fall(diagnosis: Diagnosis) -> list[str]:
+    """What becomes of the gap once what is named is added, a sentence each."""
+    gap = diagnosis.gap
+    text = f"{_figures(gap)}{',' if gap.at_floor else ' and'} {_falls(gap)} once that is added"
     if gap.falls and gap.shrinks_by is not None:
         value, low, high = (min(one, 1.0) for one in gap.shrinks_by)
         text += f", by {_percent((value, low, high))} of what is above noise"
-    return f"{text}.{no_better_text(gap)}{rest_text(diagnosis)}"
+    return [f"{text}.", *_no_better(gap), *_left(diagnosis)]
 
 
 def findings_title(diagnosis: Diagnosis) -> str:
@@ -197,39 +253,30 @@ def rivals(diagnosis: Diagnosis) -> list[tuple[str, float]]:
     return [(" with ".join(map(title_of, item.effects)) or "no effect", item.probability) for item in likely[:_RIVALS]]
 
 
-def fall_text(gap: Gap) -> str:
+def _falls(gap: Gap) -> str:
     """What becomes of the gap once what was found is added: a verb and the figure."""
     if gap.at_floor:
         return f"over all probes at its floor of {gap.floor:.2f} already, and {gap.after:.2f}"
     return f"falls to {gap.after:.2f}" if gap.falls else f"does not fall ({gap.after:.2f})"
 
 
-def no_better_text(gap: Gap) -> str:
-    """That the improved twin is none, where the gap does not fall; empty elsewhere."""
+def _no_better(gap: Gap) -> list[str]:
+    """That the improved twin is none, where the gap does not fall."""
     if gap.falls or gap.at_floor:
-        return ""
-    grown = ""
+        return []
+    told = []
     if gap.shrinks_by is not None:
         value, low, high = gap.shrinks_by
-        grown = f" What is above noise grows by {_percent((-value, -high, -low))}."
-    return f"{grown} The twin with it added is no better than the twin without."
+        told.append(f"What is above noise grows by {_percent((-value, -high, -low))}.")
+    return [*told, "The twin with it added is no better than the twin without."]
 
 
-def share_text(share: tuple[float, float, float] | None) -> str:
-    """Share of the gap that an effect removes, in words where it removes none; empty where there was no gap to remove."""
-    if share is None:
-        return ""
-    value = 100.0 * min(share[0], 1.0)
-    return f"{value:.0f} %" if value >= 0.0 else f"grows by {-value:.0f} %"
-
-
-def rest_text(diagnosis: Diagnosis) -> str:
-    """By how much laws of what is named are off here, and where they leave most; empty where they fit."""
+def _left(diagnosis: Diagnosis) -> list[str]:
+    """By how much laws of what is named are off here, and where they leave most; nothing where they fit."""
     if diagnosis.verdict != "explained_in_part":
-        return ""
+        return []
     leading = diagnosis.leading
     off = [f"{title_of(cause.effect)} by some {100.0 * cause.level:.0f} %" for cause in leading if cause.level > 0.0]
-    told = f"; these laws seem to be off here: {', '.join(off)}" if off else ""
     left = leading[0].left if leading else ()
-    place = f", most in the {_place_text(left[0])}" if left else ""
-    return f" The law leaves a misfit that is no noise{place}{told}."
+    told = [f"The law leaves a misfit that is no noise{f', most in the {place_text(left[0])}' if left else ''}."]
+    return [*told, *([f"These laws seem to be off here: {', '.join(off)}."] if off else [])]

@@ -13,7 +13,7 @@ from ...reports.chart import SERIES_COLOURS, SHAPES, Shape, asinh_ticks, rows_px
 from ..inference.inference import title_of
 from ..judgement.answer import Diagnosis
 from ..problem.problem import SeriesView
-from .explanation import axis_text
+from .words import axis_text, statistic_text
 
 # of -log transmission, evenly up to 2 and by its logarithm beyond
 _DEPTH_TICKS = (0.0, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -218,14 +218,14 @@ def places_chart(diagnosis: Diagnosis) -> Chart:
         chosen = np.flatnonzero([probe.axis == axis for probe in problem.names])
         jitter = (number - len(axes) / 2) / (1.4 * len(axes))
         named = [
-            f"{series[problem.series_of[one]]}: {problem.names[one].statistic} {problem.names[one].location}"
+            f"{series[problem.series_of[one]]}: {statistic_text(problem.names[one].statistic, problem.names[one].location)}"
             for one in chosen
         ]
         marks.append(
             Points(
                 x=problem.series_of[chosen] + jitter,
                 y=z[chosen],
-                names=[text.strip() for text in named],
+                names=named,
                 label=axis_text(axis),
                 colour=SERIES_COLOURS[number % len(SERIES_COLOURS)],
                 shape=_shape(number),

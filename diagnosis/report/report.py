@@ -15,24 +15,11 @@ from ..inference.inference import title_of
 from ..judgement.answer import Cause, Diagnosis
 from ..problem.assemble import map_changes
 from ..session.binned_twin import effect_in_squares
-from .explanation import (
-    axis_text,
-    compared_text,
-    fall_text,
-    findings_title,
-    location_text,
-    no_better_text,
-    rest_text,
-    rivals,
-    share_text,
-    strained_text,
-    strength_text,
-    verdict_text,
-)
+from .explanation import compared_text, headline, lead_text, strained_text, verdict_text
 from .figures import gap_maps, held_out_chart, hypotheses_chart, places_chart, transmission_curves
+from .words import axis_text, location_text, share_text, statistic_text, strength_text, when_text
 
 _MAPS = 4  # series whose maps are drawn
-_SINCE = {"calibration": "since the calibration"}
 
 
 def residuals_after(diagnosis: Diagnosis) -> list[NDArray[np.float32]]:
@@ -125,58 +112,6 @@ def write_report(
         nuisances=len(diagnosis.compared.factor_names),
         inputs=answer["inputs"],
     )
-
-
-def headline(diagnosis: Diagnosis) -> str:
-    """The answer in one line."""
-    if diagnosis.no_gap_but_findings:
-        return findings_title(diagnosis)
-    found = _headline_of_verdict(diagnosis)
-    if not diagnosis.findings:
-        return found
-    title = findings_title(diagnosis)
-    # what makes labels look wrong may be that effect
-    return f"{found}. {title}, too" if diagnosis.verdict == "unknown_effect" else f"{title}. The other series: {found}"
-
-
-def _headline_of_verdict(diagnosis: Diagnosis) -> str:
-    """What explains the series that were compared."""
-    if diagnosis.verdict == "no_gap":
-        return "No gap: the session agrees with its twin"
-    if diagnosis.verdict == "unknown_effect":
-        return "An effect that is not in the catalogue"
-    if diagnosis.verdict == "ambiguous":
-        names = [title for title, _ in rivals(diagnosis)[:3]]
-        return _sentence(f"{' or '.join(names)}: these data cannot distinguish them")
-    named = _sentence(" and ".join(f"{title_of(cause.effect)}, {strength_text(cause)}" for cause in diagnosis.leading))
-    if not (diagnosis.gap.falls or diagnosis.gap.at_floor):
-        return f"{named}: most like it, but the gap does not fall"
-    return f"{named}: its law leaves a misfit" if diagnosis.verdict == "explained_in_part" else named
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
-
-
-def lead_text(diagnosis: Diagnosis) -> str:
-    """Where the gap is observed and what becomes of it, in two to four sentences."""
-    gap = diagnosis.gap
-    if diagnosis.findings:
-        count = len({name for item in diagnosis.findings for name in item.names})
-        told = f"{count} series contradict what they state"
-        told = diagnosis.findings[0].line if len(diagnosis.findings) == 1 else told
-        return f"{told}. All else is of the other series. {verdict_text(diagnosis)}"
-    if not diagnosis.added or not diagnosis.where:
-        return verdict_text(diagnosis)
-    place = diagnosis.where[0]
-    seen = f"The gap is clearest in the {axis_text(place.axis)} of {place.series}"
-    if gap.at_floor:
-        return (
-            f"{seen}. Over all probes of series that the fit did not use, the gap was at its floor of {gap.floor:.2f} already:"
-            f" {gap.before:.2f}, and {gap.after:.2f} with what was found added to the twin.{rest_text(diagnosis)}"
-        )
-    ends = f"the gap on series that the fit did not use, {gap.before:.2f} (1: noise alone), {fall_text(gap)}"
-    return f"{seen}. With what was found added to the twin, {ends}.{no_better_text(gap)}{rest_text(diagnosis)}"
 
 
 _LABELS = (
@@ -292,7 +227,7 @@ def _causes(diagnosis: Diagnosis) -> SortedTable:
             f"{cause.probability:.3f}",
             strength_text(cause),
             ", ".join(f"{name} {value:.3g}" for name, value in cause.parameters.items()),
-            f"in {', '.join(cause.series)} only" if cause.series else _SINCE.get(cause.since, "always there"),
+            when_text(cause),
             share_text(cause.shrinks_by),
             f"{100.0 * cause.level:.0f} %",
         )
@@ -307,7 +242,7 @@ def _where(answer: Mapping[str, Any]) -> SortedTable:
         (
             axis_text(place["axis"]),
             place["series"],
-            place["statistic"],
+            statistic_text(place["statistic"]),
             location_text(place["location"]),
             f"{place['z']:+.1f}",
         )

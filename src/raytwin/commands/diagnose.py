@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ..campaign.task_page import task_text
     from ..diagnosis.advice.plan import table_text
     from ..diagnosis.advice.plan_session import SessionPlan
-    from ..diagnosis.report.explanation import paragraph
+    from ..diagnosis.report.explanation import answer_text
 
     with Bar(only_on_terminal=True) as bar:
         found = diagnose(
@@ -118,17 +118,16 @@ def run(arguments: argparse.Namespace) -> int:
         text = "\n".join([table_text(found.distinguishability), *missing])
         answer(found.to_dict(), as_json=arguments.json, text=text)
         return 0
-    for item in found.findings:
-        say(f"finding: {item.line}")
     for line in found.warnings:
         say(f"not used: {line}")
-    for line in found.notes:
-        say(line)
-    text = paragraph(found)
+    if arguments.json:  # the text has these
+        for line in (*(f"finding: {item.line}" for item in found.findings), *found.notes):
+            say(line)
+    text = answer_text(found)
     if found.task is not None:
         for line in found.task["warnings"]:
             say(f"warning: {line}")
-        text += f" {task_text(found.task)}"
+        text += f"\n{task_text(found.task)}"
     answer(found.to_dict(), as_json=arguments.json, text=f"{text}\nreport: {arguments.output / 'report.html'}")
     return 0
 

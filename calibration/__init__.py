@@ -19,6 +19,10 @@ Files:
     common_noise          noise that the pixels of a frame share
     frame_memory          noise that frames take over from those before them
     spectral_fit          posterior of tube, filtration and scintillator
+    spectral_data         what flats, wedges and dosimeters say of it
+    spectral_model        the declared tube and detector, and priors
+    spectral_posterior    the posterior given these
+    posterior_draws       draws from it
     priors                what is known before flats are looked at
     wedges                plates of known thickness
     tube                  a tube calibrated with a dosimeter
@@ -75,10 +79,10 @@ if TYPE_CHECKING:
         PRIORS,
         Prior,
     )
+    from .spectral_data import geometry_factor
     from .spectral_fit import (
         SpectralFit,
         fit_spectrum,
-        geometry_factor,
     )
     from .spread_fit import (
         SpreadFit,
@@ -114,7 +118,7 @@ _LAZY = {
     "effective_frames": "frame_sums",
     "fit_spectrum": "spectral_fit",
     "fit_spread": "spread_fit",
-    "geometry_factor": "spectral_fit",
+    "geometry_factor": "spectral_data",
     "rank_measurements": "next_measurement",
     "sum_frames": "frame_sums",
     "validate_twin": "validate",

@@ -27,16 +27,9 @@ from .output_table import OutputTable
 from .photon_transfer import PhotonTransfer, compute_photon_transfer
 from .priors import PRIORS
 from .setting_errors import allowing_for_darks, allowing_for_settings, mean_change
-from .spectral_fit import (
-    SpectralFit,
-    Transmission,
-    contradicts,
-    fit_evidence,
-    fit_spectrum,
-    model_for,
-    unlike_output,
-    wedges_depart,
-)
+from .spectral_data import Transmission
+from .spectral_fit import SpectralFit, contradicts, fit_evidence, fit_spectrum, unlike_output, wedges_depart
+from .spectral_model import model_for
 from .transmission_table import TransmissionTable
 from .tube import DoseData, dose_data, fit_without_strays, table_evidence
 from .wedges import measure_transmissions, wedge_evidence

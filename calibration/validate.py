@@ -24,7 +24,7 @@ from ..generator.predictions.predict import predict_flatfield
 from ..results import Result, Table, axes_or_new, counted, frame, plain
 from .frame_sums import effective_frames, sum_frames
 from .priors import WEDGE_THICKNESS
-from .spectral_fit import Transmission
+from .spectral_data import Transmission
 from .wedges import measure_transmissions, predict_transmission, transmissions_of_evidence
 
 if TYPE_CHECKING:

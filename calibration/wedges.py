@@ -17,7 +17,7 @@ from ..generator.predictions.predict import spectral_model_of
 from ..materials import material_from_name, optical_depth
 from .frame_sums import sum_frames
 from .priors import ATTENUATION_SCALE, SHARES_CORRELATION, TABLE_SHARE
-from .spectral_fit import Transmission
+from .spectral_data import Transmission
 
 KINDS = ("wedge", "slab")
 # A transmission carries at least this: scatter, flatness, the flat's own drift.

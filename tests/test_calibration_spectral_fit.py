@@ -11,20 +11,13 @@ from scipy.stats import binom
 
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter, filters_from_text
-from raytwin.calibration import spectral_fit
+from raytwin.calibration import posterior_draws, spectral_fit
+from raytwin.calibration.posterior_draws import Draws, walked
 from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY, draw_parameters
-from raytwin.calibration.spectral_fit import (
-    OTHER_SCINTILLATOR,
-    SHAPE_PARAMETERS,
-    Transmission,
-    _Posterior,
-    _repeated_levels,
-    correction_from_spectra,
-    fit_spectrum,
-    geometry_factor,
-    model_for,
-    priors_for,
-)
+from raytwin.calibration.spectral_data import Transmission, geometry_factor, repeated_levels
+from raytwin.calibration.spectral_fit import fit_spectrum
+from raytwin.calibration.spectral_model import OTHER_SCINTILLATOR, correction_from_spectra, model_for, priors_for
+from raytwin.calibration.spectral_posterior import SHAPE_PARAMETERS, Posterior
 from raytwin.errors import FitError, InputError
 from raytwin.generator.line.spectral_signal import OpenBeam, SpectralModel
 from raytwin.generator.line.twin import Estimate, Level, NoiseModel, SpreadEstimate, estimate_from_sd
@@ -345,7 +338,7 @@ def test_likelihood_of_repeats_is_that_of_any_level(model):
     """Against the integral over the level, for series of different sampling noise."""
     logs, sampling = np.array([0.0, 0.002, -0.001]), np.array([5e-4, 1e-3, 7e-4])
     priors = priors_for(model, scintillator_declared=True)
-    fit = _Posterior(model, priors, [], [], {"level": None, "gain": None}, [(logs, sampling)])
+    fit = Posterior(model, priors, [], [], {"level": None, "gain": None}, [(logs, sampling)])
     sizes = np.array([1e-4, 1e-3, 4e-3])
     level = np.linspace(-0.05, 0.05, 20001)
     exact = []
@@ -364,7 +357,7 @@ def test_rows_of_repeats_that_say_nothing_are_passed_over():
         {"mean_signal_DN": [100.0, -1.0], "sampling_percent": [0.1, 0.1]},
         {"mean_signal_DN": [100.0, 101.0], "sampling_percent": [0.1, 0.0]},
     ]
-    assert _repeated_levels(rows) == []
+    assert repeated_levels(rows) == []
 
 
 def test_without_a_declared_scintillator_both_kinds_are_weighed():
@@ -469,9 +462,9 @@ def test_a_posterior_that_is_hard_to_draw_is_drawn_by_walkers(model, monkeypatch
     truth = typical(model, inherent_filtration_mm_Al=1.4, kV_error=-0.006)
     levels = levels_of(model, truth, BEAMS)
     easy = fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(5))
-    monkeypatch.setattr(spectral_fit, "_ROUNDS", 1)
+    monkeypatch.setattr(posterior_draws, "_ROUNDS", 1)
     for name in ("_ROUND_DRAWS", "_FINAL_DRAWS"):
-        monkeypatch.setattr(spectral_fit, name, 64)
+        monkeypatch.setattr(posterior_draws, name, 64)
     fit = fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(6))
     assert fit.effective_draws >= 200
     assert fit.chi_square < 0.5
@@ -480,15 +473,14 @@ def test_a_posterior_that_is_hard_to_draw_is_drawn_by_walkers(model, monkeypatch
         assert np.mean(other) == pytest.approx(np.mean(one), abs=0.25 * np.std(one))
         assert np.std(other) == pytest.approx(np.std(one), rel=0.2)
     # walkers that stay where they are are draws of nothing
-    monkeypatch.setattr(spectral_fit, "_MOST_SWEEPS", 0)
+    monkeypatch.setattr(posterior_draws, "_MOST_SWEEPS", 0)
     with pytest.raises(FitError, match="could not be drawn"):
         fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(6))
 
 
 def test_walkers_follow_a_bent_posterior():
-    class Bent(spectral_fit._Posterior):
-        def __init__(self):
-            pass
+    class Bent:
+        dimensions = 2
 
         def log_likelihood(self, u):
             inside = u[:, 0] > -1.0
@@ -497,9 +489,11 @@ def test_walkers_follow_a_bent_posterior():
     rng = np.random.default_rng(8)
     u = rng.standard_normal((2048, 2))
     bent = Bent()
-    walkers, likelihood, effective = bent._walked(u, bent.log_likelihood(u), np.zeros(2048), rng)
-    assert effective > 500
-    assert likelihood == pytest.approx(bent.log_likelihood(walkers))
+    start = Draws(u=u, likelihood=bent.log_likelihood(u), weight=np.full(2048, 1 / 2048), effective=0.0)
+    found = walked(bent, start, np.zeros(2048), rng)
+    walkers = found.u
+    assert found.effective > 500
+    assert found.likelihood == pytest.approx(bent.log_likelihood(walkers))
     # along the bend: exp(-x^2 / 2 - x^4 / 2) beyond -1
     x = np.linspace(-1.0, 4.0, 20001)
     density = np.exp(-0.5 * x**2 - 0.5 * x**4)
@@ -651,5 +645,5 @@ def test_a_cover_that_nobody_declares_widens_the_dose_and_one_declared_does_not(
 def test_derivatives_are_taken_no_farther_than_where_the_model_has_numbers(wanted, taken):
     posterior = SimpleNamespace(about=np.zeros(2), _conditional=lambda u: (None, np.full((len(u), 2), wanted)))
     draws, weight = np.zeros((8, 3)), np.full(8, 0.125)
-    spectral_fit._Posterior.relinearise(posterior, draws, weight, np.random.default_rng(0))
+    Posterior.relinearise(posterior, draws, weight, np.random.default_rng(0))
     np.testing.assert_array_equal(posterior.about, [taken, taken])

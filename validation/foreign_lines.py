@@ -48,7 +48,9 @@ from tqdm import tqdm
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter, Setting, filters_from_text
 from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY, SHARES_CORRELATION, TABLE_SHARE
-from raytwin.calibration.spectral_fit import fit_spectrum, geometry_factor, model_for, priors_for
+from raytwin.calibration.spectral_data import geometry_factor
+from raytwin.calibration.spectral_fit import fit_spectrum
+from raytwin.calibration.spectral_model import model_for, priors_for
 from raytwin.generator.line.spectral_signal import OTHER_TABLES, OpenBeam, SpectralModel
 from raytwin.generator.line.twin import DetectorMaps, Level, NoiseModel, Twin, estimate_from_sd, gaussian_spread
 from raytwin.generator.predictions.predict import predict_flatfield

@@ -100,7 +100,7 @@ class Screening:
 
     Fields: observer (file of a calibrated one; None: calibrated on the campaign's own first settings); train_first (settings that it
     is calibrated on); round (settings trained before it is asked again); most (settings trained in all, None: no limit); detector,
-    image (see `observers.Observer`).
+    image (see `observers.Observer`; no image: see `observers.sight_of_references`).
     """
 
     observer: Path | None = None
@@ -108,7 +108,7 @@ class Screening:
     round: int = 4
     most: int | None = None
     detector: str = "ideal"
-    image: str = "residual"
+    image: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -739,7 +739,7 @@ def _screening(words: _Words, folder: Path) -> Screening:
         round=words.whole("round", usual.round, least=1),
         most=words.whole("most", None, least=1),
         detector=words.choice("detector", usual.detector, tuple(DETECTORS)),
-        image=words.choice("image", usual.image, IMAGES),
+        image=words.choice("image", "", IMAGES) if "image" in words else None,
     )
     if screening.observer is not None:
         for word in ("train_first", "detector", "image"):

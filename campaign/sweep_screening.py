@@ -205,7 +205,7 @@ class Screen:
     """
 
     def __init__(self, campaign: Campaign, tests: Path, outlooks: Sequence[Outlook]) -> None:
-        from ..observers import LineImages, Observer, objects_and_texture, read_efficiency
+        from ..observers import LineImages, Observer, read_efficiency, sight_of_references
 
         screening = campaign.screening or Screening()
         self.campaign, self._screening = campaign, screening
@@ -220,28 +220,26 @@ class Screen:
                     received=f"an observer calibrated for {self.efficiency.size_name}",
                     expected=f"one for {campaign.curve.size}, the size of this campaign",
                 )
-        self._observer: Observer = (
-            Observer(
-                detector=screening.detector,
-                image=screening.image,
-                false_alarm_rate=campaign.trying.marked_share,
-            )
-            if self.efficiency is None
-            else self.efficiency.observer
-        )
+        calibrated = None if self.efficiency is None else self.efficiency.observer
+        detector = screening.detector if calibrated is None else calibrated.detector
         self.line: LineImages = LineImages(read_twin(campaign.twin))
         with open_references(tests, "references") as dataset:
-            objects, texture = objects_and_texture(
+            sight = sight_of_references(
                 self.line,
                 dataset,
                 product_material=campaign.product_material,
                 foreign_material=campaign.foreign_material,
                 size=campaign.curve.size,
-                with_texture=self._observer.image in ("low", "high"),
+                detector=detector,
+                image=screening.image if calibrated is None else calibrated.image,
                 fallback=campaign.reference_setting,
             )
+        self._observer: Observer = calibrated or Observer(
+            detector=detector, image=sight.image, false_alarm_rate=campaign.trying.marked_share
+        )
+        objects = sight.objects
         self.objects: ForeignObjects = objects
-        self.texture: ProductTexture | None = texture
+        self.texture: ProductTexture | None = sight.texture
         self.largest = float(objects.size.max())
         own = self.line.twin.instrument.source_detector_mm
         pairs = {
@@ -249,7 +247,7 @@ class Screen:
             for one in outlooks
             if one.feasible and all(setting.binning == 1 for setting in one.pair)
         }
-        against = self.line.reasons_against(list(pairs.values()), objects)
+        against = self.line.reasons_against(list(pairs.values()), objects, image=sight.image)
         self._pairs = {text: pair for (text, pair), reason in zip(pairs.items(), against, strict=True) if not reason}
         self.kept = [one.text for one in outlooks if one.kept]
         self._sizes: dict[str, float] = {}

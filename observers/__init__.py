@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from .frequencies import frequency_bins as frequency_bins
     from .frequencies import object_spectrum as object_spectrum
     from .line_images import IMAGES as IMAGES
+    from .line_images import TEXTURED as TEXTURED
     from .line_images import LineImages as LineImages
     from .objects import ForeignObjects as ForeignObjects
     from .objects import Shape as Shape
@@ -36,7 +37,8 @@ if TYPE_CHECKING:
     from .observe import Observed as Observed
     from .observe import Observer as Observer
     from .observe import observe_settings as observe_settings
-    from .reference_objects import objects_and_texture as objects_and_texture
+    from .reference_objects import Sight as Sight
+    from .reference_objects import sight_of_references as sight_of_references
     from .search import independent_places as independent_places
     from .search import search_threshold as search_threshold
     from .texture import ProductTexture as ProductTexture
@@ -48,6 +50,7 @@ _HOME = {
     "Efficiency": "efficiency",
     "ForeignObjects": "objects",
     "IMAGES": "line_images",
+    "TEXTURED": "line_images",
     "LineImages": "line_images",
     "MeasuredSize": "efficiency",
     "Observed": "observe",
@@ -59,7 +62,8 @@ _HOME = {
     "frequency_bins": "frequencies",
     "independent_places": "search",
     "object_spectrum": "frequencies",
-    "objects_and_texture": "reference_objects",
+    "Sight": "reference_objects",
+    "sight_of_references": "reference_objects",
     "objects_of_references": "objects",
     "objects_of_shape": "objects",
     "observe_settings": "observe",

@@ -11,9 +11,10 @@ P(f) is the power that the optical spread leaves of the quanta. The images of a 
 
 | image | a | b |
 |---|---|---|
-| residual | 1 | -dM_low / dM_high of the product: its thickness drops out; what networks are shown |
+| residual | 1 | -dM_low / dM_high of the product: its thickness drops out |
 | quotient | 1 | -M_low / M_high: the quotient that Delta R is read from, to first order |
 | low, high | 1, 0 | 0, 1: one image, in which the product's texture is noise |
+| both | the best at each frequency | of images whose texture is one and the same |
 """
 
 import math
@@ -42,7 +43,8 @@ from .objects import ForeignObjects, ReferenceObjects, spectra_of_masks
 FloatArray = NDArray[np.float64]
 Pair = tuple[Setting, Setting]
 
-IMAGES = ("residual", "quotient", "low", "high")
+IMAGES = ("residual", "quotient", "low", "high", "both")
+TEXTURED = ("low", "high", "both")  # in these the product's texture is noise
 _STEP = 0.01  # relative, of the product's thickness, to see how one log image follows the other
 _THICKEST_MM = 2000.0
 
@@ -60,18 +62,18 @@ class _Beam:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PairImages:
-    """One combined image at many settings.
+    """Images to look at, one combined image or both log images, at many settings.
 
-    Fields: signal (2, setting, object): weighted change of each log image; quantum, white (setting, object): powers in the combined
-    image, before the spread and white; delta_R (setting, object): difference of the quotient; product_slope (setting, object):
-    change of the image with the product's thickness, /mm.
+    Fields: signal (image, 2, setting, object): what the object's change of each log image adds to an image; product_slope, alike:
+    what a change of the product's thickness adds, /mm; quantum, white (image, setting, object): powers in an image, before the
+    spread and white; delta_R (setting, object): difference of the quotient.
     """
 
     signal: FloatArray
+    product_slope: FloatArray
     quantum: FloatArray
     white: FloatArray
     delta_R: FloatArray
-    product_slope: FloatArray
 
 
 class LineImages:
@@ -245,14 +247,16 @@ class LineImages:
             source_detector_mm=distance.pop(),
         )
 
-    def reasons_against(self, pairs: Sequence[Pair], objects: ForeignObjects) -> tuple[str, ...]:
-        """Why nothing can be said of images at each pair (pair,); empty: it can.
+    def reasons_against(
+        self, pairs: Sequence[Pair], objects: ForeignObjects, *, image: str = "both"
+    ) -> tuple[str, ...]:
+        """Why nothing can be said of an image at each pair (pair,), or of those that it is made of; empty: it can.
 
         A limit of tube, readout or belt is broken; the open field, which every image is divided by, saturates; or a pixel
         behind the product (the median of the objects') holds so little signal that its logarithm is no straight one.
         """
         reasons = [""] * len(pairs)
-        for side in (0, 1):
+        for side in {"low": (0,), "high": (1,)}.get(image, (0, 1)):
             settings = [pair[side] for pair in pairs]
             levels = self._levels(settings)
             for number, one in enumerate(settings):
@@ -286,7 +290,7 @@ class LineImages:
         return math.sqrt(variance_DN2 / setting.averaged) / signal_DN
 
     def pair_images(self, pairs: Sequence[Pair], objects: ForeignObjects, *, image: str = "residual") -> PairImages:
-        """Signals and noise of one combined image at every pair of settings; see the module.
+        """Signals and noise of the images to look at, at every pair of settings; see the module.
 
         Raises:
             InputError: an unknown image, binned settings, settings without load, objects that nothing gets through.
@@ -325,21 +329,22 @@ class LineImages:
                     (secondary / signal_DN + read / signal_DN**2) / frames,
                 )
             )
-        low, high = sides
-        whole, none = np.ones_like(low[0]), np.zeros_like(low[0])
-        combined: dict[str, tuple[FloatArray, FloatArray]] = {
-            "residual": (whole, -low[2] / high[2]),
-            "quotient": (whole, -low[0] / high[0]),
-            "low": (whole, none),
-            "high": (none, whole),
+        product, with_object, slope, quantum, white = (np.stack(one) for one in zip(*sides, strict=True))
+        whole, none = np.ones_like(product[0]), np.zeros_like(product[0])
+        weights = {
+            "residual": [(whole, -slope[0] / slope[1])],
+            "quotient": [(whole, -product[0] / product[1])],
+            "low": [(whole, none)],
+            "high": [(none, whole)],
+            "both": [(whole, none), (none, whole)],
         }
-        weights = combined[image]
+        mixed = np.array(weights[image])  # (image, 2, setting, object)
         return PairImages(
-            signal=np.stack([weight * (side[1] - side[0]) for weight, side in zip(weights, sides, strict=True)]),
-            quantum=weights[0] ** 2 * low[3] + weights[1] ** 2 * high[3],
-            white=weights[0] ** 2 * low[4] + weights[1] ** 2 * high[4],
-            delta_R=low[1] / high[1] - low[0] / high[0],
-            product_slope=weights[0] * low[2] + weights[1] * high[2],
+            signal=mixed * (with_object - product),
+            quantum=(mixed**2 * quantum).sum(axis=1),
+            white=(mixed**2 * white).sum(axis=1),
+            product_slope=mixed * slope,
+            delta_R=with_object[0] / with_object[1] - product[0] / product[1],
         )
 
     def product_at(

@@ -38,9 +38,9 @@ USUAL_FALSE_ALARMS = 0.01
 class Observer:
     """Who looks.
 
-    Fields: detector (a key of `DETECTORS`); image (a key of `line_images.IMAGES`); false_alarm_rate (share of images without object
-    that show an alarm); efficiency (of d'^2; above 1 where networks use more than this image); internal_noise (standard deviation
-    in a pixel of the combined log image, added white); link and log_size of curves that are fitted to sampled objects.
+    Fields: detector (a key of `DETECTORS`); image (a key of `line_images.IMAGES`; `both` is for `ideal`); false_alarm_rate (share of
+    images without object that show an alarm); efficiency (of d'^2; above 1 where networks use more than this image); internal_noise
+    (standard deviation in a pixel of the image, added white); link and log_size of curves that are fitted to sampled objects.
 
     Example:
         >>> from raytwin.observers import Observer
@@ -59,6 +59,12 @@ class Observer:
     def __post_init__(self) -> None:
         if self.detector not in DETECTORS:
             raise InputError("detector", received=self.detector, expected="one of " + ", ".join(DETECTORS))
+        if self.image == "both" and self.detector != "ideal":
+            raise InputError(
+                "detector",
+                received=f"{self.detector} of the image `both`",
+                expected="`ideal`, which weighs two images against each other",
+            )
         if not 0 < self.false_alarm_rate < 1:
             raise InputError("false-alarm rate", received=self.false_alarm_rate, expected="between 0 and 1")
         if not (math.isfinite(self.efficiency) and self.efficiency > 0):
@@ -165,10 +171,7 @@ class PreparedSettings:
         self._spread_power, self._optical = line.noise_power(bins), line.optical_transfer(bins)
         self._moving = np.array([any(line.motion_px(one) > 0 for one in pair) for pair in pairs])
         self._motion = line.motion_transfers(pairs, bins) * self._optical if self._moving.any() else None
-        self._texture = None
-        if texture is not None:
-            # the optical spread blurs what stands in the beam
-            self._texture = texture.power(bins, line.object_pixel_mm) * self._optical**2
+        self._texture = None if texture is None else texture.power(bins, line.object_pixel_mm)
 
     @property
     def delta_R(self) -> FloatArray:
@@ -177,28 +180,34 @@ class PreparedSettings:
 
     @property
     def pixel_variance(self) -> FloatArray:
-        """Power of the combined image's noise (setting, object) at frequency 0, before internal noise."""
-        return self._images.quantum + self._images.white
+        """Power of the image's noise (setting, object) at frequency 0, before internal noise; of both: of their best mean."""
+        power = self._images.quantum + self._images.white
+        return np.asarray(1.0 / np.sum(1.0 / power, axis=0))
+
+    def _through(self, changes: FloatArray, part: slice) -> FloatArray:
+        """Changes of each log image (image, 2, setting, object), blurred and added up (image, setting, object, bin)."""
+        changes = changes[..., None]
+        if self._motion is None or not self._moving[part].any():
+            return np.asarray(changes.sum(axis=1) * self._optical)
+        transfer = self._motion[:, part, None, :]
+        return np.asarray(changes[:, 0] * transfer[0] + changes[:, 1] * transfer[1])
 
     def d_and_threshold(self, internal_noise: float) -> tuple[FloatArray, FloatArray]:
         """d' at full efficiency and the threshold of the search (setting, object) each."""
         images, objects, observer = self._images, self._objects, self._observer
         detect = DETECTORS[observer.detector]
-        count = images.quantum.shape
+        count = images.delta_R.shape
         squared, row, column = (np.empty(count) for _ in range(3))
         step = max(1, _AT_ONCE // (count[1] * objects.bins.share.size))
         for first in range(0, count[0], step):
             part = slice(first, first + step)
-            signal = images.signal[:, part, :, None]
-            if self._motion is not None and self._moving[part].any():
-                transfer = self._motion[:, part, None, :]
-                filtered = signal[0] * transfer[0] + signal[1] * transfer[1]
-            else:
-                filtered = signal.sum(axis=0) * self._optical
-            power = images.quantum[part, :, None] * self._spread_power
-            power += images.white[part, :, None] + internal_noise**2
+            filtered = self._through(images.signal[:, :, part], part)
+            texture = None
             if self._texture is not None:
-                power += images.product_slope[part, :, None] ** 2 * self._texture
+                texture = self._through(images.product_slope[:, :, part], part), self._texture
+            power = images.quantum[:, part, :, None] * self._spread_power
+            power += images.white[:, part, :, None] + internal_noise**2
+            filtered, power = _best_of(filtered, power, texture)
             found = detect(objects.energy * filtered**2, objects.amplitude * filtered, power, objects.bins)
             squared[part] = found.d_squared
             row[part], column[part] = found.row_correlation, found.column_correlation
@@ -209,6 +218,28 @@ class PreparedSettings:
             false_alarm_rate=observer.false_alarm_rate,
         )
         return np.sqrt(np.maximum(squared, 0.0)), threshold
+
+
+def _best_of(
+    signal: FloatArray, power: FloatArray, texture: tuple[FloatArray, FloatArray] | None
+) -> tuple[FloatArray, FloatArray]:
+    """Signal and noise power (setting, object, bin) of one image, or of the best combination of two at each frequency.
+
+    The best weights are K^-1 s, with K = diag(power) + thickness slope slope'; these make of s, and of the noise, s' K^-1 s.
+
+    Args:
+        signal, power: of each image (image, setting, object, bin), the noise independent from image to image.
+        texture: change of each image with the product's thickness (image, setting, object, bin), /mm, and the power of this thickness
+            (bin,), mm^2, one and the same in all images; None: an even product.
+    """
+    if len(signal) == 1:
+        return signal[0], power[0] if texture is None else power[0] + texture[0][0] ** 2 * texture[1]
+    found = (signal**2 / power).sum(axis=0)
+    if texture is not None:
+        slope, thickness = texture
+        alike = (signal * slope / power).sum(axis=0)
+        found -= thickness * alike**2 / (1.0 + thickness * (slope**2 / power).sum(axis=0))
+    return found, found
 
 
 def sizes_of_pod(

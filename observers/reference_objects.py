@@ -1,53 +1,67 @@
-"""What an observer looks for in reference images: their foreign objects, and the texture of the product where its image shows it."""
+"""What an observer looks at in reference images: their foreign objects, the image, the texture of the product."""
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 from ..acquisition.dataset_io import Dataset
 from ..acquisition.setting import Setting, setting_from_text
 from ..errors import InputError
-from .line_images import LineImages
+from .line_images import TEXTURED, LineImages
 from .objects import ForeignObjects, objects_of_references
-
-if TYPE_CHECKING:
-    from .texture import ProductTexture
+from .texture import ProductTexture, texture_of_references
 
 Pair = tuple[Setting, Setting]
 
 
-def objects_and_texture(
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sight:
+    """What is looked at. Fields: objects; image (a key of `line_images.IMAGES`); texture of the product (None: there is none)."""
+
+    objects: ForeignObjects
+    image: str
+    texture: ProductTexture | None
+
+
+def sight_of_references(
     line: LineImages,
     dataset: Dataset,
     *,
     product_material: str,
     foreign_material: str,
     size: str,
-    with_texture: bool,
+    detector: str,
+    image: str | None = None,
     fallback: Pair | None = None,
-) -> "tuple[ForeignObjects, ProductTexture | None]":
-    """Objects of a dataset of references, and the product's texture where it is asked for.
+) -> Sight:
+    """What an observer looks at in a dataset of references.
 
     Args:
         line: the twin.
         dataset: low-noise images with masks, each with its setting.
         product_material, foreign_material: names of the library.
         size: `contrast` or `size_mm`.
-        with_texture: of an observer whose image the product's texture is noise in.
+        detector: who looks.
+        image: None: both, where `detector` is `ideal` and the product's texture can be read; else the residual image, which the
+            texture drops out of.
         fallback: setting of references that do not say theirs.
 
     Raises:
-        InputError: references that do not say their setting, or without objects of known contrast.
+        InputError: references that do not say their setting, or without objects of known contrast; no texture where `image` shows it.
     """
     found = objects_of_references(dataset, pixel_mm=line.pixel_mm)
     low, semicolon, high = found.setting.partition(";")
     pair = (setting_from_text(low), setting_from_text(high)) if semicolon else fallback
     if pair is None:
         raise InputError(dataset.path, received="references without their settings", expected="LOW;HIGH in each row")
+    if image is None and detector != "ideal":
+        image = "residual"
     texture = None
-    if with_texture:
-        from .texture import texture_of_references
-
-        texture = texture_of_references(dataset, line, pair=pair, material=product_material)
+    if image is None or image in TEXTURED:
+        try:
+            texture = texture_of_references(dataset, line, pair=pair, material=product_material)
+        except InputError:
+            if image is not None:
+                raise
     objects = line.objects_from_references(
         found, pair=pair, product_material=product_material, foreign_material=foreign_material, size=size
     )
-    return objects, texture
+    return Sight(objects=objects, image=image or ("residual" if texture is None else "both"), texture=texture)

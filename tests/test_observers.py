@@ -164,10 +164,10 @@ def test_matched_filters_on_drawn_noise_find_what_the_curve_says(line):
         assert place == np.searchsorted(np.unique(objects.size), objects.size[number])
         frequency = np.fft.fftfreq(cells)
         transfer = line.twin.noise.spread.value.transfer(frequency[:, None], frequency[None, :])
-        contrast = images.signal[:, 0, number].sum() / objects.object_mm[number]
+        contrast = images.signal[0, :, 0, number].sum() / objects.object_mm[number]
         spectrum = np.fft.fft2(profile, s=(cells, cells)) * transfer * contrast
-        power = images.quantum[0, number] * whole_spectrum(line.twin.noise.spread.value.noise_power(cells))
-        power += images.white[0, number]
+        power = images.quantum[0, 0, number] * whole_spectrum(line.twin.noise.spread.value.noise_power(cells))
+        power += images.white[0, 0, number]
         noise = np.fft.fft2(rng.standard_normal((count, cells, cells))) * np.sqrt(power)
         values = np.fft.ifft2((noise + spectrum) * np.conj(spectrum)).real[:, 0, 0]
         values /= math.sqrt(np.sum(np.abs(spectrum) ** 2 * power) / cells**2)
@@ -196,10 +196,29 @@ def test_signal_and_noise_of_a_plate_are_those_of_the_predicted_contrast(line):
     known = SlabContrasts(line.twin, product=product, foreign_object=thing).contrast(low, high, intervals=False)
     images = line.pair_images([(low, high)], plates, image="low")
     assert images.delta_R[0, 0] == pytest.approx(known.delta_R.value, rel=1e-3)
-    assert images.signal[0, 0, 0] == pytest.approx(known.low.M_object - known.low.M_product, rel=1e-3)
+    assert images.signal[0, 0, 0, 0] == pytest.approx(known.low.M_object - known.low.M_product, rel=1e-3)
     share = line.twin.noise.spread.value.variance_share
-    sd = math.sqrt(images.quantum[0, 0] * share + images.white[0, 0])
+    sd = math.sqrt(images.quantum[0, 0, 0] * share + images.white[0, 0, 0])
     assert sd == pytest.approx(known.low.sd_M_product, rel=0.01)
+
+
+def test_both_images_are_seen_as_well_as_their_texture_allows(line):
+    """No texture: all that each image shows; the more of it, the nearer to the combination that it drops out of."""
+    objects, pair = rods(line), [pair_at(40)]
+
+    def squared(image, texture=None):
+        return observe_settings(line, pair, objects, observer=Observer(image=image), texture=texture).d_prime[0] ** 2
+
+    def some(amount):
+        return ProductTexture(amplitude_mm4=amount, exponent=0.0, lowest_per_mm=0.02)
+
+    assert squared("both") == pytest.approx(squared("low") + squared("high"), rel=1e-9)
+    assert squared("both", some(1e6)) == pytest.approx(squared("residual"), rel=1e-3)
+    between = squared("both", some(0.01))
+    for least in (squared("residual"), squared("low", some(0.01)), squared("high", some(0.01))):
+        assert np.all(between > least)
+    with pytest.raises(InputError, match="weighs two images"):
+        Observer(image="both", detector="npw")
 
 
 def test_exposure_motion_and_texture_move_a90_the_way_they_must(line):
@@ -248,7 +267,7 @@ def test_what_no_size_reaches_is_no_number(line):
         (lambda line: rods(line, product_mm=[1.0], displaces=True), "whose place it takes"),
         (lambda line: observe_settings(line, [], rods(line)), "one pair"),
         (lambda line: observe_settings(line, [pair_at(10, binning=2)], rods(line)), "binning"),
-        (lambda line: observe_settings(line, [pair_at(10)], rods(line), observer=Observer(image="both")), "residual"),
+        (lambda line: observe_settings(line, [pair_at(10)], rods(line), observer=Observer(image="all")), "residual"),
         (
             lambda line: search_threshold(row_correlation=0, column_correlation=0, area_px=9, false_alarm_rate=2),
             "between 0 and 1",

@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from ..acquisition.setting import Filter, Setting, filter_from_text, setting_from_text
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from ..acquisition import Dataset
     from ..generator.line.twin import Twin
-    from ..observers import Efficiency, ForeignObjects, LineImages, ProductTexture
+    from ..observers import Efficiency, ForeignObjects, LineImages, Sight
 
 _UNITS = {"contrast": "", "size_mm": "mm"}
 _SIZES = 24
@@ -172,7 +172,8 @@ def observe(
         displaces: the shape takes the product's place.
         references: in place of a shape: a dataset of low-noise images, whose objects are looked for (they take the product's place).
         product_material, foreign_material, size: of the references; size is `contrast` or `size_mm`.
-        detector: `ideal` (default), `hotelling`, `npw` or `npwe`; image: `residual` (default), `quotient`, `low` or `high`.
+        detector: `ideal` (default), `hotelling`, `npw` or `npwe`; image: `residual` (default of a shape), `quotient`, `low`,
+            `high` or `both` (default of references, where detector and texture of the product allow it).
         false_alarm_rate: share of images without object that show an alarm; default 0.01.
         calibrated: of `calibrate_observer`, or its file; it brings detector, image and false alarms along.
 
@@ -191,7 +192,7 @@ def observe(
     import numpy as np
 
     from ..generator.predictions.contrast import check_pair
-    from ..observers import LineImages, Observer, observe_settings, predicted_sizes
+    from ..observers import LineImages, Observer, Sight, observe_settings, predicted_sizes
 
     pairs = _pairs(settings)
     line = LineImages(as_twin(twin))
@@ -208,16 +209,12 @@ def observe(
         )
     if changes:
         observer = Observer(**changes)
-    if observer.image in ("residual", "quotient"):
-        for pair in pairs:
-            check_pair(*pair)
     if (references is None) == (product is None and foreign_object is None):
         raise InputError(
             "product and references",
             received="neither" if references is None else "both",
             expected="a product and a foreign object, or a dataset of references",
         )
-    texture: ProductTexture | None = None
     if references is None:
         if product is None or foreign_object is None:
             raise InputError("product and foreign_object", received="one of the two", expected="both")
@@ -229,18 +226,25 @@ def observe(
             sizes_mm=sizes_mm,
             displaces=displaces,
         )
+        sight = Sight(objects=objects, image=observer.image, texture=None)
     else:
-        objects, texture = objects_of_file(
+        sight = _sight_of_file(
             line,
             references,
             product_material=product_material,
             foreign_material=foreign_material,
             size=size,
-            with_texture=observer.image in ("low", "high"),
+            detector=observer.detector,
+            image=observer.image if efficiency is not None else image,
         )
+        objects, observer = sight.objects, replace(observer, image=sight.image)
+    if observer.image in ("residual", "quotient"):
+        for pair in pairs:
+            check_pair(*pair)
+    texture = sight.texture
     found = observe_settings(line, pairs, objects, observer=observer, texture=texture)
     expected = None if efficiency is None else predicted_sizes(line, pairs, objects, efficiency, texture=texture)
-    against = line.reasons_against(pairs, objects)
+    against = line.reasons_against(pairs, objects, image=observer.image)
     warnings = [*line.warnings, *(reason for reason in against if reason), *_outside(line, pairs)]
     largest = float(objects.size.max())
     if efficiency is None:
@@ -285,10 +289,10 @@ def calibrate_observer(
     twin: "Twin | PathLike",
     sweep: PathLike,
     *,
-    product_material: str = "chicken_breast",
-    foreign_material: str = "rib_bone",
+    product_material: str | None = None,
+    foreign_material: str | None = None,
     detector: str = "ideal",
-    image: str = "residual",
+    image: str | None = None,
     false_alarm_rate: float | None = None,
 ) -> CalibratedObserver:
     """An observer brought to the networks of a sweep: efficiency and internal noise, and how far left-out settings depart.
@@ -296,7 +300,7 @@ def calibrate_observer(
     Args:
         twin: the line that the sweep was of.
         sweep: folder of a finished `sweep` with reference images and four settings or more that have an a90.
-        product_material, foreign_material: of the references.
+        product_material, foreign_material: of the references; None: as the sweep's campaign says.
         detector, image: as of `observe`.
         false_alarm_rate: None: the mean over the sweep's settings.
 
@@ -316,6 +320,7 @@ def calibrate_observer(
         answer = json.loads((folder / "sweep.json").read_text(encoding="utf-8"))
         rows = [row for row in answer["rows"] if row["a90"] is not None]
         size = answer["size"]
+        own_product, own_foreign = answer["materials"]
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(
             "sweep",
@@ -336,13 +341,14 @@ def calibrate_observer(
             )
         false_alarm_rate = sum(rates) / len(rates)
     line = LineImages(as_twin(twin))
-    objects, texture = objects_of_file(
+    sight = _sight_of_file(
         line,
         tests,
-        product_material=product_material,
-        foreign_material=foreign_material,
+        product_material=product_material or own_product,
+        foreign_material=foreign_material or own_foreign,
         size=size,
-        with_texture=image in ("low", "high"),
+        detector=detector,
+        image=image,
     )
     measured = [
         MeasuredSize(
@@ -353,36 +359,40 @@ def calibrate_observer(
         )
         for row in rows
     ]
-    observer = Observer(detector=detector, image=image, false_alarm_rate=false_alarm_rate)
-    return CalibratedObserver(efficiency=fit_efficiency(line, measured, objects, observer=observer, texture=texture))
+    observer = Observer(detector=detector, image=sight.image, false_alarm_rate=false_alarm_rate)
+    return CalibratedObserver(
+        efficiency=fit_efficiency(line, measured, sight.objects, observer=observer, texture=sight.texture)
+    )
 
 
-def objects_of_file(
+def _sight_of_file(
     line: "LineImages",
     references: "Dataset | PathLike",
     *,
     product_material: str,
     foreign_material: str,
     size: str,
-    with_texture: bool,
-) -> "tuple[ForeignObjects, ProductTexture | None]":
-    """Objects of a dataset of references, and the product's texture where it is asked for.
+    detector: str,
+    image: str | None,
+) -> "Sight":
+    """What an observer looks at in a dataset of references.
 
     Raises:
         InputError: references that do not say their setting, or without objects of known contrast.
     """
-    from ..observers import objects_and_texture
+    from ..observers import sight_of_references
 
     if size not in _UNITS:
         raise InputError("size", received=size, expected="contrast or size_mm")
     with dataset_of(references) as dataset:
-        return objects_and_texture(
+        return sight_of_references(
             line,
             dataset,
             product_material=product_material,
             foreign_material=foreign_material,
             size=size,
-            with_texture=with_texture,
+            detector=detector,
+            image=image,
         )
 
 

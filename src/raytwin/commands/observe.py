@@ -36,11 +36,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--sizes-mm", metavar="MM,MM,...", help="lengths to look at (default: half a pixel to 120 pixels)")
     add("--displaces", action="store_true", help="the object takes the product's place")
     add("--references", metavar="DATASET", type=Path, help="in place of a shape: the objects of these images")
-    add("--product-material", default="chicken_breast", metavar="MATERIAL", help="of the references")
-    add("--foreign-material", default="rib_bone", metavar="MATERIAL", help="of the references")
+    add(
+        "--product-material",
+        metavar="MATERIAL",
+        help="of the references (default chicken_breast; of --networks the sweep's)",
+    )
+    add(
+        "--foreign-material", metavar="MATERIAL", help="of the references (default rib_bone; of --networks the sweep's)"
+    )
     add("--size", default="contrast", choices=("contrast", "size_mm"), help="of the references (default contrast)")
     add("--detector", help="ideal (default), hotelling, npw or npwe")
-    add("--image", help="residual (default), quotient, low or high")
+    add(
+        "--image",
+        help="residual (default of a shape), quotient, low, high or both (default of references whose texture can be read)",
+    )
     add(
         "--false-alarms",
         type=float,
@@ -60,13 +69,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.save is not None and arguments.networks is None:
         raise InputError("--save", received="no --networks", expected="a sweep to calibrate the observer to")
     given = {"detector": arguments.detector, "image": arguments.image}
+    given |= {"product_material": arguments.product_material, "foreign_material": arguments.foreign_material}
     words: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if arguments.networks is not None:
         calibrated = calibrate_observer(
             arguments.twin,
             arguments.networks,
-            product_material=arguments.product_material,
-            foreign_material=arguments.foreign_material,
             false_alarm_rate=arguments.false_alarms,
             **words,
         )
@@ -90,8 +98,6 @@ def run(arguments: argparse.Namespace) -> int:
         sizes_mm=_sizes(arguments.sizes_mm),
         displaces=arguments.displaces,
         references=arguments.references,
-        product_material=arguments.product_material,
-        foreign_material=arguments.foreign_material,
         size=arguments.size,
         false_alarm_rate=arguments.false_alarms,
         calibrated=arguments.calibrated,

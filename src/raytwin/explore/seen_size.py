@@ -12,19 +12,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..acquisition.dataset_io import read_dataset
-from ..errors import InputError
 from ..generator.line.twin import Estimate, Twin
 from ..observers import (
     Efficiency,
     ForeignObjects,
     LineImages,
     Observer,
+    ProductTexture,
     Shape,
-    objects_and_texture,
     objects_of_shape,
     observe_settings,
     predicted_sizes,
     read_efficiency,
+    sight_of_references,
 )
 from .state import ExplorerState
 
@@ -53,11 +53,13 @@ class SeenSize:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworksObserver:
-    """An observer that was brought to networks, and the objects that they look for. Fields: name; efficiency; objects; texture."""
+    """An observer that was brought to networks, and what they look at. Fields: name; efficiency; objects; texture of the product,
+    where the observer's image shows it."""
 
     name: str
     efficiency: Efficiency
     objects: ForeignObjects
+    texture: ProductTexture | None = None
 
 
 def read_networks_observer(
@@ -71,25 +73,20 @@ def read_networks_observer(
     """A calibrated observer with the objects of a dataset.
 
     Raises:
-        InputError, FileFormatError: no such files, other kinds of files, an observer of an image that shows the product's texture.
+        InputError, FileFormatError: no such files, other kinds of files.
     """
     efficiency = read_efficiency(path)
-    if efficiency.observer.image in ("low", "high"):
-        raise InputError(
-            path,
-            received=f"an observer of the {efficiency.observer.image} image",
-            expected="one of the residual or the quotient image",
-        )
     with read_dataset(references) as dataset:
-        objects, _ = objects_and_texture(
+        sight = sight_of_references(
             LineImages(twin),
             dataset,
             product_material=product_material,
             foreign_material=foreign_material,
             size=efficiency.size_name,
-            with_texture=False,
+            detector=efficiency.observer.detector,
+            image=efficiency.observer.image,
         )
-    return NetworksObserver(name=path, efficiency=efficiency, objects=objects)
+    return NetworksObserver(name=path, efficiency=efficiency, objects=sight.objects, texture=sight.texture)
 
 
 class Eye:
@@ -160,7 +157,8 @@ class Eye:
             pod = float(ndtr(d_prime - float(np.interp(shown, sizes, found.threshold[0]))))
         networks = None
         if self._networks is not None:
-            expected = predicted_sizes(self._line, [pair], self._networks.objects, self._networks.efficiency)
+            of = self._networks
+            expected = predicted_sizes(self._line, [pair], of.objects, of.efficiency, texture=of.texture)
             ends = [float(one[0]) for one in (expected.a90, expected.low, expected.high)]
             networks = Estimate(value=ends[0], low=ends[1], high=ends[2]) if _all_finite(ends) else None
         return SeenSize(

@@ -15,7 +15,7 @@ from .flat_levels import SeriesPoint, load_mAs_of, scatter_of_flats
 from .noise_of_flats import FlatNoise
 from .noise_power import correlation_of_quanta
 from .repeated_frames import beam_of
-from .spread_fit import series_differ
+from .series_scatter import series_differ
 
 _POOR_FIT = 2.0  # chi-square a degree of freedom: five standard deviations for 50 degrees
 

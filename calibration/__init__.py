@@ -23,7 +23,8 @@ Files:
     spread_agreement      measured noise power against the fitted, and a second route to the gain
     series_scatter        whether the noise of series agrees with what is fitted to all
     spread_fit            optical spread, gain and read noise from the noise power of all series
-    noise_of_flats        the series that this fit takes
+    noise_sources         the series that this fit takes
+    noise_of_flats        the fit to these, less flats that bend away from the line
     repeated_frames       noise where flats are single frames
     common_noise          noise that the pixels of a frame share
     frame_memory          noise that frames take over from those before them

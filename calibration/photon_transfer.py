@@ -34,8 +34,9 @@ from .frame_checks import repeated_frame_indices, row_length_shown, same_scene, 
 from .frame_sums import PIECE_BYTES, sum_frames
 from .full_scale import full_scale_reached, reaches, top_of_range
 from .interpolated_pixels import find_interpolated
-from .noise_of_flats import FlatNoise, FlatPair, fit_flat_noise, pairs_of_singles
+from .noise_of_flats import FlatNoise, fit_flat_noise
 from .noise_power import SMALLEST_SQUARE_PX
+from .noise_sources import FlatPair, pairs_of_singles
 from .repeated_frames import (
     OPEN,
     Beam,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from raytwin.calibration.frame_sums import sum_frames
+from raytwin.calibration.frames.frame_sums import sum_frames
 
 FRAMES, SHAPE, TURNS = 200, (760, 956), 5
 STREAMED, PIECE = 5000, 11

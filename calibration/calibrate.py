@@ -22,17 +22,17 @@ from ..spectra import (
     energy_grid_keV,
     tube_fluence_interpolated,
 )
+from .flats.photon_transfer import PhotonTransfer, compute_photon_transfer
+from .flats.setting_errors import allowing_for_darks, allowing_for_settings, mean_change
 from .next_measurement import advice, voltages_within_reach
-from .output_table import OutputTable
-from .photon_transfer import PhotonTransfer, compute_photon_transfer
-from .priors import PRIORS
-from .setting_errors import allowing_for_darks, allowing_for_settings, mean_change
-from .spectral_data import Transmission
-from .spectral_fit import SpectralFit, contradicts, fit_evidence, fit_spectrum, unlike_output, wedges_depart
-from .spectral_model import model_for
-from .transmission_table import TransmissionTable
-from .tube import DoseData, dose_data, fit_without_strays, table_evidence
-from .wedges import measure_transmissions, wedge_evidence
+from .spectrum.output_table import OutputTable
+from .spectrum.priors import PRIORS
+from .spectrum.spectral_data import Transmission
+from .spectrum.spectral_fit import SpectralFit, contradicts, fit_evidence, fit_spectrum, unlike_output, wedges_depart
+from .spectrum.spectral_model import model_for
+from .spectrum.transmission_table import TransmissionTable
+from .spectrum.tube import DoseData, dose_data, fit_without_strays, table_evidence
+from .spectrum.wedges import measure_transmissions, wedge_evidence
 
 __all__ = ["bad_pixel_counts", "calibrate_twin", "calibration_answer"]
 

@@ -16,7 +16,7 @@ from ..generator.line.twin import Z95, Estimate, Twin
 from ..generator.predictions.predict import spectral_model_of
 from ..materials import material_from_name, transmission
 from ..spectra import MAXIMUM_KV_OF_ANODE, MINIMUM_KV
-from .priors import WEDGE_THICKNESS
+from .spectrum.priors import WEDGE_THICKNESS
 
 # what a person has at hand: plates for the beam, and a wedge of aluminium
 _PLATES = ("", "Cu:0.1", "Al:2", "Cu:0.5")

@@ -22,10 +22,10 @@ from ..generator.line.measured_flats import measured_flats
 from ..generator.line.twin import Z95, Estimate, Twin
 from ..generator.predictions.predict import predict_flatfield
 from ..results import Result, Table, axes_or_new, counted, frame, plain
-from .frame_sums import effective_frames, sum_frames
-from .priors import WEDGE_THICKNESS
-from .spectral_data import Transmission
-from .wedges import measure_transmissions, predict_transmission, transmissions_of_evidence
+from .frames.frame_sums import effective_frames, sum_frames
+from .spectrum.priors import WEDGE_THICKNESS
+from .spectrum.spectral_data import Transmission
+from .spectrum.wedges import measure_transmissions, predict_transmission, transmissions_of_evidence
 
 if TYPE_CHECKING:
     import pandas
@@ -423,7 +423,7 @@ def leave_one_out(
     Raises:
         FitError: a posterior that cannot be drawn.
     """
-    from .spectral_fit import fit_spectrum
+    from .spectrum.spectral_fit import fit_spectrum
 
     tell = progress or (lambda name: None)
     usable = [level for level in twin.levels if level.kV is not None and level.rate_DN_per_mAs is not None]

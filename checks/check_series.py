@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.series_roles import calibrating_names, commonest_shape
-from ..calibration.bad_pixels import is_noisy
-from ..calibration.code_steps import code_step
-from ..calibration.frame_checks import LEVEL_CHANGE, SceneChange
-from ..calibration.noise_power import SMALLEST_SQUARE_PX
+from ..calibration.frames.bad_pixels import is_noisy
+from ..calibration.frames.code_steps import code_step
+from ..calibration.frames.frame_checks import LEVEL_CHANGE, SceneChange
+from ..calibration.spread.noise_power import SMALLEST_SQUARE_PX
 from ..errors import FileFormatError, InputError
 from . import frame_signs
 from .allowances import NO_PATTERN, UNFIT, allowed_by, next_measurements, series_row

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.code_steps import FALSE_ALARM, code_step
+from ..calibration.frames.code_steps import FALSE_ALARM, code_step
 
 _MOST_AVERAGED = 256
 _CODES_AT_TOP = 10

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile
-from ..calibration.priors import PRIORS
-from ..calibration.spectral_model import model_for
+from ..calibration.spectrum.priors import PRIORS
+from ..calibration.spectrum.spectral_model import model_for
 from ..errors import InputError
 from ..generator.line.spectral_signal import OpenBeam, SpectralModel
 from .readings import FloatArray, Label, Reading

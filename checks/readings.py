@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.setting import Filter
-from ..calibration.frame_checks import repeats_the_last
+from ..calibration.frames.frame_checks import repeats_the_last
 from ..errors import InputError
 
 FloatArray = NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import PIECE_BYTES, Series
-from ..calibration.frame_checks import CopyScan, SceneScan, with_median_at
+from ..calibration.frames.frame_checks import CopyScan, SceneScan, with_median_at
 
 _SAMPLE_FRAMES = 4  # whose values are kept whole, spread over the first piece
 _SAMPLE_VALUES = 4_000_000

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.calibration.bad_pixels import find_bad_pixels
-from raytwin.calibration.code_steps import least_change
-from raytwin.calibration.dark_frames import DarkFrames
+from raytwin.calibration.frames.bad_pixels import find_bad_pixels
+from raytwin.calibration.frames.code_steps import least_change
+from raytwin.calibration.frames.dark_frames import DarkFrames
 from raytwin.generator.line.twin import BAD_PIXEL_CODES
 
 SHAPE = (48, 48)

@@ -14,11 +14,11 @@ import pytest
 import raytwin as rt
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter, Setting, filters_from_text
-from raytwin.calibration.dose_data import KermaRatio, KermaReading
-from raytwin.calibration.output_table import read_output_table
-from raytwin.calibration.spectral_fit import SpectralFit, fit_spectrum
-from raytwin.calibration.transmission_table import read_transmission_table
-from raytwin.calibration.tube import calibrate_tube, departures, dose_data, predict_ratio, suspects
+from raytwin.calibration.spectrum.dose_data import KermaRatio, KermaReading
+from raytwin.calibration.spectrum.output_table import read_output_table
+from raytwin.calibration.spectrum.spectral_fit import SpectralFit, fit_spectrum
+from raytwin.calibration.spectrum.transmission_table import read_transmission_table
+from raytwin.calibration.spectrum.tube import calibrate_tube, departures, dose_data, predict_ratio, suspects
 from raytwin.cli import main
 from raytwin.errors import InputError
 from raytwin.generator.line.spectral_signal import KERMA_OUTPUT, OpenBeam, SpectralModel

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from raytwin.calibration.frame_checks import (
+from raytwin.calibration.frames.frame_checks import (
     SceneChange,
     growth_of_noise,
     repeated_frame_indices,

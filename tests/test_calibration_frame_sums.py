@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from raytwin.calibration.frame_sums import effective_frames, sum_frames
+from raytwin.calibration.frames.frame_sums import effective_frames, sum_frames
 from raytwin.errors import InputError
 
 

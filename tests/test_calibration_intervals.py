@@ -8,9 +8,9 @@ from scipy.stats import norm
 
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import filters_from_text
-from raytwin.calibration.flat_levels import median_variance
-from raytwin.calibration.priors import SHARES_CORRELATION, TABLE_SHARE
-from raytwin.calibration.spectral_fit import _sd_of_mixture, fit_spectrum
+from raytwin.calibration.flats.flat_levels import median_variance
+from raytwin.calibration.spectrum.priors import SHARES_CORRELATION, TABLE_SHARE
+from raytwin.calibration.spectrum.spectral_fit import _sd_of_mixture, fit_spectrum
 from raytwin.generator.line.twin import Estimate, Level, NoiseModel, estimate_from_sd, gaussian_spread
 from raytwin.generator.line.twin_spectrum import secondary_of_levels, slope_over_gain
 from raytwin.generator.spread.psf import blur_variance_share

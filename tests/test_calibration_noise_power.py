@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from raytwin.calibration.noise_power import (
+from raytwin.calibration.spread.noise_power import (
     compute_difference_power,
     compute_noise_power,
     correlation_of_quanta,

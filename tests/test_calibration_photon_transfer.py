@@ -9,7 +9,7 @@ import pytest
 from raytwin.acquisition import Setting, open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.calibration.calibrate import bad_pixel_counts, calibrate_twin, calibration_answer
-from raytwin.calibration.photon_transfer import compute_photon_transfer
+from raytwin.calibration.flats.photon_transfer import compute_photon_transfer
 from raytwin.errors import FitError, InputError
 from raytwin.generator.line.twin import BAD_PIXEL_CODES
 from raytwin.generator.spread.noise import sample_frame_noise

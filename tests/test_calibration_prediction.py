@@ -12,10 +12,10 @@ import pytest
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Setting, filters_from_text
 from raytwin.calibration.next_measurement import advice, rank_measurements
-from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY
-from raytwin.calibration.spectral_data import geometry_factor
-from raytwin.calibration.spectral_fit import fit_spectrum
-from raytwin.calibration.spectral_model import model_for
+from raytwin.calibration.spectrum.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY
+from raytwin.calibration.spectrum.spectral_data import geometry_factor
+from raytwin.calibration.spectrum.spectral_fit import fit_spectrum
+from raytwin.calibration.spectrum.spectral_model import model_for
 from raytwin.generator.line.spectral_signal import OpenBeam
 from raytwin.generator.line.twin import DetectorMaps, Level, NoiseModel, Twin, estimate_from_sd, gaussian_spread
 from raytwin.generator.predictions.predict import predict_flatfield

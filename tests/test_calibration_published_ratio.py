@@ -10,9 +10,9 @@ from scipy.stats import norm
 
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter
-from raytwin.calibration.priors import draw_parameters, ripple_from_latent
-from raytwin.calibration.spectral_fit import fit_spectrum
-from raytwin.calibration.spectral_model import priors_for
+from raytwin.calibration.spectrum.priors import draw_parameters, ripple_from_latent
+from raytwin.calibration.spectrum.spectral_fit import fit_spectrum
+from raytwin.calibration.spectrum.spectral_model import priors_for
 from raytwin.generator.line.spectral_signal import OpenBeam, SpectralModel
 from raytwin.generator.line.twin import Estimate, Level
 

@@ -7,8 +7,8 @@ import pytest
 
 from raytwin.acquisition import Setting, open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
-from raytwin.calibration.photon_transfer import compute_photon_transfer
-from raytwin.calibration.repeated_frames import most_read_variance
+from raytwin.calibration.flats.photon_transfer import compute_photon_transfer
+from raytwin.calibration.flats.repeated_frames import most_read_variance
 from raytwin.diagnosis.session.preparation import calibrated_twin
 from raytwin.diagnosis.session.session import only_own_noise, read_session
 from raytwin.errors import FitError, InputError

@@ -10,10 +10,10 @@ import raytwin as rt
 from raytwin.acquisition import Filter, Setting, open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.sessions import merge_sessions, one_layer, select_layer
-from raytwin.calibration.bad_pixels import cluster_evidence
 from raytwin.calibration.calibrate import bad_pixel_counts
-from raytwin.calibration.noise_power import compute_noise_power
-from raytwin.calibration.photon_transfer import compute_photon_transfer
+from raytwin.calibration.flats.photon_transfer import compute_photon_transfer
+from raytwin.calibration.frames.bad_pixels import cluster_evidence
+from raytwin.calibration.spread.noise_power import compute_noise_power
 from raytwin.cli import main
 from raytwin.errors import InputError
 from raytwin.generator.line.twin import BAD_PIXEL_CODES

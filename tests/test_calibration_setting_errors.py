@@ -9,8 +9,8 @@ import pytest
 from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.acquisition.setting import Setting, filters_from_text
 from raytwin.calibration.calibrate import calibrate_twin
-from raytwin.calibration.flat_levels import SeriesPoint
-from raytwin.calibration.setting_errors import (
+from raytwin.calibration.flats.flat_levels import SeriesPoint
+from raytwin.calibration.flats.setting_errors import (
     BEND_SD,
     DISTANCE_SD,
     EXPOSURE_SD_MS,

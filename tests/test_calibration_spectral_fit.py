@@ -11,13 +11,18 @@ from scipy.stats import binom
 
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter, filters_from_text
-from raytwin.calibration import posterior_draws, spectral_fit
-from raytwin.calibration.posterior_draws import Draws, walked
-from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY, draw_parameters
-from raytwin.calibration.spectral_data import Transmission, geometry_factor, repeated_levels
-from raytwin.calibration.spectral_fit import fit_spectrum
-from raytwin.calibration.spectral_model import OTHER_SCINTILLATOR, correction_from_spectra, model_for, priors_for
-from raytwin.calibration.spectral_posterior import SHAPE_PARAMETERS, Posterior
+from raytwin.calibration.spectrum import posterior_draws, spectral_fit
+from raytwin.calibration.spectrum.posterior_draws import Draws, walked
+from raytwin.calibration.spectrum.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY, draw_parameters
+from raytwin.calibration.spectrum.spectral_data import Transmission, geometry_factor, repeated_levels
+from raytwin.calibration.spectrum.spectral_fit import fit_spectrum
+from raytwin.calibration.spectrum.spectral_model import (
+    OTHER_SCINTILLATOR,
+    correction_from_spectra,
+    model_for,
+    priors_for,
+)
+from raytwin.calibration.spectrum.spectral_posterior import SHAPE_PARAMETERS, Posterior
 from raytwin.errors import FitError, InputError
 from raytwin.generator.line.spectral_signal import OpenBeam, SpectralModel
 from raytwin.generator.line.twin import Estimate, Level, NoiseModel, SpreadEstimate, estimate_from_sd

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import correlate1d
 
-from raytwin.calibration.noise_power import compute_difference_power, compute_noise_power
-from raytwin.calibration.spread_fit import fit_spread
+from raytwin.calibration.spread.noise_power import compute_difference_power, compute_noise_power
+from raytwin.calibration.spread.spread_fit import fit_spread
 from raytwin.errors import FitError
 from raytwin.generator.spread.noise import sample_frame_noise
 from raytwin.generator.spread.psf import Spread

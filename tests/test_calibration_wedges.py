@@ -11,13 +11,13 @@ from raytwin.acquisition.acquisition_io import write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Setting, filters_from_text
 from raytwin.calibration.calibrate import calibrate_twin
-from raytwin.calibration.validate import leave_one_out, plot_validation, validate_twin
-from raytwin.calibration.wedges import (
+from raytwin.calibration.spectrum.wedges import (
     _away_from_borders,
     measure_transmissions,
     predict_transmission,
     transmissions_of_evidence,
 )
+from raytwin.calibration.validate import leave_one_out, plot_validation, validate_twin
 from raytwin.cli import main
 from raytwin.errors import InputError
 from raytwin.generator.line.spectral_signal import OpenBeam, SpectralModel

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from raytwin.calibration.priors import PRIORS
+from raytwin.calibration.spectrum.priors import PRIORS
 from raytwin.checks.findings import Finding, FindingCode
 from raytwin.diagnosis.diagnose_session import _with_findings
 from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, title_of

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.api._given import as_twin
-from raytwin.calibration.priors import PRIORS
-from raytwin.calibration.setting_errors import EXPOSURE_SD_MS
+from raytwin.calibration.flats.setting_errors import EXPOSURE_SD_MS
+from raytwin.calibration.spectrum.priors import PRIORS
 from raytwin.diagnosis.model import changes as scales
 from raytwin.diagnosis.model.calibrated_maps import calibrated_maps
 from raytwin.diagnosis.model.changes import Change, catalogue_variants, departures_found, twin_changes

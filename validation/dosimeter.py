@@ -31,9 +31,9 @@ from tqdm import tqdm
 
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter, Setting, filters_from_text, text_from_filters
-from raytwin.calibration.output_table import OutputTable, read_output_table
-from raytwin.calibration.transmission_table import read_transmission_table
-from raytwin.calibration.tube import calibrate_tube, predict_ratio
+from raytwin.calibration.spectrum.output_table import OutputTable, read_output_table
+from raytwin.calibration.spectrum.transmission_table import read_transmission_table
+from raytwin.calibration.spectrum.tube import calibrate_tube, predict_ratio
 from raytwin.generator.predictions.tube_twin import TubeTwin, predict_spectrum, predict_tube
 from raytwin.generator.twins.twin_answer import equivalent_filtration
 from raytwin.lab.attenuation import mu_per_mm

@@ -19,7 +19,7 @@ full beside what any line has (filtration, thickness, 1 % of voltage, 1 % of fil
     thin         60 to 80 % of the label's scintillator gadox       Gd2O2S, filled to 50 to 70 %
     mixed        each of these with a chance of one half
 
-No size in `calibration.priors` was learned on any of them: each has its own source there.
+No size in `calibration.spectrum.priors` was learned on any of them: each has its own source there.
 
 Protocols: A  40 and 90 kV, with 2 mm Al and without;  B  90 kV, with 2 mm Al and without;
            C  40, 70 and 110 kV, with 2 mm Al and without;  D  40 and 90 kV behind 0.05 mm Cu (the paper's).
@@ -47,10 +47,10 @@ from tqdm import tqdm
 
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter, Setting, filters_from_text
-from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY, SHARES_CORRELATION, TABLE_SHARE
-from raytwin.calibration.spectral_data import geometry_factor
-from raytwin.calibration.spectral_fit import fit_spectrum
-from raytwin.calibration.spectral_model import model_for, priors_for
+from raytwin.calibration.spectrum.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY, SHARES_CORRELATION, TABLE_SHARE
+from raytwin.calibration.spectrum.spectral_data import geometry_factor
+from raytwin.calibration.spectrum.spectral_fit import fit_spectrum
+from raytwin.calibration.spectrum.spectral_model import model_for, priors_for
 from raytwin.generator.line.spectral_signal import OTHER_TABLES, OpenBeam, SpectralModel
 from raytwin.generator.line.twin import DetectorMaps, Level, NoiseModel, Twin, estimate_from_sd, gaussian_spread
 from raytwin.generator.predictions.predict import predict_flatfield

@@ -48,7 +48,7 @@ from raytwin.acquisition.acquisition_io import write_acquisition
 from raytwin.acquisition.setting import Filter, Setting, filters_from_text, setting_from_text, text_from_filters
 from raytwin.calibration.calibrate import calibrate_twin
 from raytwin.calibration.next_measurement import rank_measurements
-from raytwin.calibration.priors import (
+from raytwin.calibration.spectrum.priors import (
     ATTENUATION_SCALE,
     GAIN_DISCREPANCY,
     LEVEL_DISCREPANCY,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...calibration.priors import (
+from ...calibration.spectrum.priors import (
     ATTENUATION_SCALE,
     DEPARTURES,
     PRIORS,

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ...calibration.setting_errors import EXPOSURE_SD_MS
+from ...calibration.flats.setting_errors import EXPOSURE_SD_MS
 from ...generator.frames.declared_spot import declared_spot_px
 from ...generator.line.line_state import FixedPattern, TilePattern
 from ..model import changes as scales

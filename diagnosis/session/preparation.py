@@ -12,7 +12,7 @@ from ...acquisition.binned_frames import binned
 from ...acquisition.cut_off import share_of_zeros, without_cut_off_darks
 from ...acquisition.series_roles import calibrating_names, commonest_shape
 from ...calibration.calibrate import calibrate_twin
-from ...calibration.repeated_frames import beam_of
+from ...calibration.flats.repeated_frames import beam_of
 from ...checks.findings import Finding, FindingCode
 from ...checks.labels import LabelCheck, check_labels
 from ...checks.readings import Explained

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...acquisition.acquisition_io import AcquisitionFile, Series
 from ...acquisition.log_images import holds_shares
 from ...acquisition.series_roles import calibrating_names
-from ...calibration.repeated_frames import Beam, beam_of
+from ...calibration.flats.repeated_frames import Beam, beam_of
 from ...errors import InputError
 from ...generator.line.series_request import SeriesRequest
 

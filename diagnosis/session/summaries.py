@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...calibration.frame_checks import CopyScan, repeats_the_last
+from ...calibration.frames.frame_checks import CopyScan, repeats_the_last
 from ...errors import InputError
 from ...generator.line.twin import LEAST_PIXELS
 

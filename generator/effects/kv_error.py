@@ -69,7 +69,7 @@ KV_ERROR = Effect(
     isolated_by="flats and two materials of known thickness at several tube voltages",
     shows=Shows(series=LIT_SERIES, axis="energy"),
     absorbed="numbers",
-    # levels go as about kV^3, by an exponent that models of tubes leave open by 0.15 (calibration.priors, hardness and output)
+    # levels go as about kV^3, by an exponent that models of tubes leave open by 0.15 (spectrum.priors of the calibration)
     reading=Reading(law_sd=0.05),
     grid=Grid(shares=(0.6, 1.0)),
     worked_in=_in_numbers,

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from ..acquisition.acquisition_io import AcquisitionFile
     from ..acquisition.instrument import Instrument
     from ..acquisition.setting import Setting
-    from ..calibration.output_table import OutputTable
-    from ..calibration.transmission_table import TransmissionTable
+    from ..calibration.spectrum.output_table import OutputTable
+    from ..calibration.spectrum.transmission_table import TransmissionTable
     from ..calibration.validate import Validation
     from ..generator.line.twin import Twin
     from ..generator.predictions.predict import Prediction, Predictions
@@ -101,7 +101,7 @@ def calibrate(
     from .. import __version__
     from ..acquisition.sessions import merge_sessions, one_layer
     from ..calibration.calibrate import calibrate_twin
-    from ..calibration.tube import calibrate_tube
+    from ..calibration.spectrum.tube import calibrate_tube
     from ..files import sha256_of_file
     from ..spectra import spectrum_from_file
 
@@ -159,8 +159,8 @@ def calibrate(
 def _tables(
     output_table: PathLike | None, transmission: PathLike | None, instrument: "Instrument | None", *, has_detector: bool
 ) -> "tuple[OutputTable | None, TransmissionTable | None]":
-    from ..calibration.output_table import read_output_table
-    from ..calibration.transmission_table import read_transmission_table
+    from ..calibration.spectrum.output_table import read_output_table
+    from ..calibration.spectrum.transmission_table import read_transmission_table
 
     anode = (None if instrument is None else instrument.anode) or "W"
     return (

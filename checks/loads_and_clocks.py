@@ -125,8 +125,13 @@ def clock_findings(series: Sequence[Series]) -> list[Finding]:
                 )
             )
     timed = [item for item in series if item.time_s is not None and item.index >= 0]
-    for earlier, later in pairwise(sorted(timed, key=lambda item: (item.session, item.index))):
-        if earlier.session == later.session and earlier.time_s is not None and later.time_s is not None:
+    # layers of a panel are exposed at once
+    for earlier, later in pairwise(sorted(timed, key=lambda item: (item.session, item.layer or "", item.index))):
+        if (
+            (earlier.session, earlier.layer) == (later.session, later.layer)
+            and earlier.time_s is not None
+            and later.time_s is not None
+        ):
             before = float(later.time_s[0]) < float(earlier.time_s[-1])
             # clocks that start anew with every series tell nothing of their order
             if before and float(later.time_s[0]) > 0 and float(earlier.time_s[0]) > 0:

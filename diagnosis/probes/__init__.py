@@ -15,5 +15,6 @@ Files:
     moving_picture      noise that a fading picture seems to add
     noise_correlation   correlation of neighbouring pixels' noise, summed
     lost_bits           kurtosis of rounded noise
+    few_quanta          kurtosis of noise of few quanta
     _projection_loops   templates weighed by the noise, compiled
 """

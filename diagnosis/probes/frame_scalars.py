@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2, SeriesSummary
+from .few_quanta import enough_quanta
 from .fixed_pattern import Pattern
 from .lasting import LEAST_FRAMES
 from .probes import (
@@ -191,7 +192,7 @@ class _Found:
                 value = float(summary.temporal_covariance_DN2[step - 1]) / stack
                 sampling = math.sqrt(shared / (self.n_good * (frames - step)))
                 self.add("time", f"temporal_correlation {step}", "1", value, sampling, "temporal_correlation")
-        if frames >= _KURTOSIS_FRAMES:
+        if frames >= _KURTOSIS_FRAMES and enough_quanta(self.base, context.areas, summary):
             sampling = math.sqrt(40.0 / (self.n_good * freedom))
             self.add("tails", "kurtosis", "1", summary.kurtosis_excess, sampling, "kurtosis")
         if context.kind in ("flat", "object") and freedom >= _LEAST_FREEDOM:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.rounding import variance_before_rounding
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
+from .few_quanta import tails_of_quanta
 from .fixed_pattern import Pattern, shares_of_pixels, shares_of_tiles
 from .lasting import BY_CHANCE, chance_in_flat, chances
 from .line_scalars import LineNoise, line_pattern
@@ -112,7 +113,9 @@ def _noise_scalars(expected: ExpectedSeries, context: ScalarContext, profile: ND
     for step in (1, 2):
         correlation = float(temporal[step - 1]) if temporal.size >= step else 0.0
         values[f"temporal_correlation {step}"] = (correlation * mean_q + moving.lasting(step)) / full
-    values["kurtosis"] = _kurtosis(expected, context, full) + moving.kurtosis(expected)
+    values["kurtosis"] = (
+        _kurtosis(expected, context, full) + moving.kurtosis(expected) + tails_of_quanta(expected, areas)
+    )
     if context.kind in ("flat", "object"):
         quantum = (mean_q * keep * correlation_sum(expected, rows, columns) + mean_w) / areas.order.size
         quantum += lines.frame(rows, columns)

@@ -5,6 +5,7 @@ Files, in the way of the light:
     scene          what stands in the beam, and where borders cut pixels
     beam           one beam behind one scene, projected once
     declared_spot  blur by the focal spot that the instrument states
+    stated_belt    blur by the belt's speed that a series states
     light          what an exposure brings to the pixels: beam, quanta and spread
     memory         what earlier exposures leave behind: lag and burn-in
     stages         from the charge to the stored number: each stage says what is expected, and draws it

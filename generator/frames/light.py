@@ -20,6 +20,7 @@ from ._spread import Kept, NoisePattern, noise_pattern, spread_maps
 from .beam import BeamProjection, model_of, project_beam
 from .declared_spot import blur_by_declared_spot
 from .model_cache import ModelCache
+from .stated_belt import blur_by_belt
 
 # what a series is called and when it was taken does not change the light
 _OF_THE_SPREAD = (
@@ -180,7 +181,7 @@ def light_of(
         use_measured_level, cache: as in `LineModel`.
     """
 
-    timed = any(effect.timed for _, effect, _ in acting)
+    timed = bool(request.belt_speed_mm_s) or any(effect.timed for _, effect, _ in acting)
     once, load_mAs = cache.made("once", (request,), timed, lambda: _at_unit_load(request, timed=timed))
     of_effects = tuple(
         (item.id, item.since, tuple(numbers.items()), tuple(item.options.items())) for item, _, numbers in acting
@@ -257,7 +258,7 @@ def _drawn(
             secondary_DN=projection.secondary_DN,
             picture=projection.picture,
             shift_px=request.displacement_px if request.thickness_mm else (0.0, 0.0),
-            object_transfers=blur_by_declared_spot(twin, request),
+            object_transfers=(*blur_by_declared_spot(twin, request), *blur_by_belt(twin, request)),
         )
         for applied, effect, numbers in acting:
             if effect.stage != "beam":

@@ -160,6 +160,30 @@ def test_objects_lie_inside_away_from_the_edge_and_from_each_other(tmp_path_fact
     assert (foreign > 0).sum() > 0
 
 
+def test_an_object_inside_is_nowhere_higher_than_the_product_is_thick(tmp_path, twin):
+    """Rods longer than their plate is thick lie flat enough; seen from the side, their shadow is no higher than the plate."""
+    from raytwin.generator.scenes.shapes import Rays, path_lengths_mm
+
+    sizes = "length_mm = 18\nwidth_mm = 14\nheight_mm = 5\n"
+    plate = f'[[product]]\nshape = "box"\nmaterial = "Al"\n{sizes}'
+    rod = '[[foreign_object]]\nshape = "rod"\nmaterial = "Fe"\nlength_mm = 10\ndiameter_mm = 0.8\n'
+    description = described(tmp_path, plate + rod + "[images]\nwith_foreign_object = 1\n")
+    field = geometry_of(twin, settings=(LOW, HIGH), line=description.line).rays()
+    line = np.arange(-7.0, 7.0, 0.05)
+    side = Rays(source_mm=1e7, y_mm=line[:, None], x_mm=line[None, :])
+    from_the_side = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    heights = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        product = sample_individual(description.products[0], name="p", rng=rng)
+        (placed,) = sample_scene(description, product, rays=field, rng=rng).foreign_objects
+        shadow = path_lengths_mm(
+            placed.individual.body, side, rotation=from_the_side @ placed.rotation, place_mm=np.zeros(3)
+        )
+        heights.append(np.ptp(line[shadow.any(axis=1)]))
+    assert max(heights) < 5.0 and max(heights) > 3.0
+
+
 def test_an_object_on_the_product_adds_to_it_and_a_void_takes_from_it(tmp_path, twin):
     rays = geometry_of(twin, settings=(LOW, HIGH)).rays()
     for text, sign in ((WIRE, 1), (ROD.replace("rib_bone", "air"), -1)):
@@ -324,6 +348,10 @@ def test_text_that_is_no_toml_and_files_that_are_not_there_are_named(tmp_path):
         (PRODUCT.replace("[22, 26]", "200"), "fits into the field"),
         (PRODUCT + ROD.replace("[2, 5]", "90") + "[images]\nwith_foreign_object = 1\n", "room in the product"),
         (PRODUCT + ROD + "[images]\nwith_foreign_object = 1\ndistance_from_edge_mm = 20\n", "room in the product"),
+        (
+            PRODUCT + ROD.replace("[0.8, 1.5]", "20").replace("[2, 5]", "20") + "[images]\nwith_foreign_object = 1\n",
+            "mm thick",
+        ),
     ],
 )
 def test_what_finds_no_room_is_said_and_leaves_no_file(tmp_path, twin, text, message):

@@ -39,7 +39,8 @@ def rays(half_mm=6.0, step_mm=STEP_MM, source_mm=FAR_MM):
 
 def octahedron(size_mm):
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / math.sqrt(3)
-    return Polyhedron(normals=signs, offsets_mm=np.full(8, size_mm / math.sqrt(3)), radius_mm=size_mm)
+    corners = size_mm * np.concatenate([np.eye(3), -np.eye(3)])
+    return Polyhedron(normals=signs, offsets_mm=np.full(8, size_mm / math.sqrt(3)), corners_mm=corners)
 
 
 SHAPES = {

@@ -17,7 +17,7 @@
     length_mm = [2, 11]
     diameter_mm = [1, 3]
     bend_mm = [15, 60]
-    where = "inside"                # takes the product's place; "on": lies on it
+    where = "inside"                # wholly in the product, whose place it takes; "on": lies on it
     orientation = "any"             # any turn in space; "lying": about the beam's axis only
 
     [images]
@@ -103,6 +103,7 @@ _IMAGE_WORDS = {
 _LINE_WORDS = ("pixel_mm", "source_object_mm", "source_detector_mm", "focal_spot_mm")
 _TRIES = 300
 _POSES = 60
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -391,6 +392,13 @@ class Placed:
         one = self.individual
         return one.body.radius_mm if one.body is not None else max(layer.radius_mm for layer in one.layers.values())
 
+    def height_mm(self, thickness_mm: Array) -> float:
+        """Extent along the beam: of a body from its top to its bottom, of layers the largest of their thickness (row, column)."""
+        body = self.individual.body
+        if body is None:
+            return float(thickness_mm.max())
+        return body.reach_mm(self.rotation[2]) + body.reach_mm(-self.rotation[2])
+
     def lengths_mm(self, rays: Rays) -> dict[str, Array]:
         """Path lengths (row, column) by material, mm."""
         one = self.individual
@@ -513,7 +521,8 @@ def place_foreign_object(
     """A foreign object at a random place in the product, and its footprint (row, column).
 
     Refused and tried again: a place nearer to the product's outline than `distance_from_edge_mm`, nearer to another object
-    than `distance_between_mm`, beyond the field, or, for one inside, where the product is thinner than the object.
+    than `distance_between_mm`, beyond the field, or, for one inside, where the product is anywhere thinner than the whole object is
+    high: within the product at one depth, wherever its surfaces lie.
 
     Raises:
         InputError: no place was found.
@@ -524,6 +533,8 @@ def place_foreign_object(
     from_edge = distance_transform_edt(np.pad(product_mm > 0, 1), sampling=pitch)[1:-1, 1:-1]
     from_others = distance_transform_edt(~taken, sampling=pitch) if taken.any() else np.full(taken.shape, math.inf)
     needed, apart = images["distance_from_edge_mm"][0], images["distance_between_mm"][0]
+    secant, inside = rays.secant(), individual.kind.where == "inside"
+    thickness = product_mm / secant
     room = np.argwhere((from_edge > needed) & (from_others > apart))
     for _ in range(_TRIES if len(room) else 0):
         row, column = room[int(rng.integers(len(room)))]
@@ -536,14 +547,16 @@ def place_foreign_object(
         rim = footprint[0].any() or footprint[-1].any() or footprint[:, 0].any() or footprint[:, -1].any()
         if rim or from_edge[footprint].min() <= needed or from_others[footprint].min() <= apart:
             continue
-        if individual.kind.where == "inside" and np.any(lengths[footprint] > product_mm[footprint]):
+        if inside and placed.height_mm(lengths / secant) > thickness[footprint].min() * (1.0 + _ROUNDING):
             continue
         return placed, footprint
+    deep = f" (at most {thickness.max():.3g} mm thick)" if inside else ""
+    remedy = "make it smaller, ask for fewer objects, or lower the distances under [images]"
     raise InputError(
         f"foreign object {individual.name}",
         received=f"an object of {individual.size_mm:.3g} mm",
-        expected=f"one with room in the product, {needed:g} mm from its edge and {apart:g} mm from other objects",
-        remedy="make it smaller, ask for fewer objects, or lower the distances under [images]",
+        expected=f"one with room in the product{deep}, {needed:g} mm from its edge and {apart:g} mm from other objects",
+        remedy=f'{remedy}; or state orientation = "lying" or where = "on"' if inside else remedy,
     )
 
 

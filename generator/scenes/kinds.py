@@ -148,11 +148,10 @@ def _shard(values: Values, rng: np.random.Generator) -> Shape:
 
     # the middle is inside: corners lie less than half a turn apart
     planes = np.column_stack([np.array(normals), -np.array(offsets)])
-    vertices = HalfspaceIntersection(planes, np.zeros(3)).intersections
     return Polyhedron(
         normals=np.array(normals),
         offsets_mm=np.array(offsets),
-        radius_mm=float(np.linalg.norm(vertices, axis=1).max()),
+        corners_mm=HalfspaceIntersection(planes, np.zeros(3)).intersections,
     )
 
 

@@ -36,6 +36,10 @@ class Mesh:
         """Longest side of the box around it."""
         return float(np.ptp(self.corners_mm.reshape(-1, 3), axis=0).max())
 
+    def reach_mm(self, direction: Array) -> float:
+        """How far it goes from its middle along a direction, mm."""
+        return float((self.corners_mm @ direction).max())
+
     def lengths_mm(self, rays: Rays, *, rotation: Array, place_mm: Array) -> Array:
         """Path lengths (row, column) of all rays through the mesh turned and moved, mm.
 

@@ -78,6 +78,10 @@ class Shape(Protocol):
         """Of a ball about the middle that holds the shape."""
         ...
 
+    def reach_mm(self, direction: Array) -> float:
+        """How far the shape goes from its middle along a direction (3,) of length 1."""
+        ...
+
     def path_mm(self, start: Array, direction: Array) -> Array:
         """Path lengths (mm) of rays start + s direction, s in mm from -infinity; arrays (3, ...)."""
         ...
@@ -89,6 +93,10 @@ class Convex(Protocol):
     @property
     def radius_mm(self) -> float:
         """Of a ball about the middle that holds the shape."""
+        ...
+
+    def reach_mm(self, direction: Array) -> float:
+        """How far the shape goes from its middle along a direction (3,) of length 1."""
         ...
 
     def interval_mm(self, start: Array, direction: Array) -> tuple[Array, Array]:
@@ -127,6 +135,10 @@ class Ellipsoid:
         """The largest half axis."""
         return max(self.half_axes_mm)
 
+    def reach_mm(self, direction: Array) -> float:
+        """How far it goes from its middle along a direction, mm."""
+        return float(np.linalg.norm(np.multiply(self.half_axes_mm, direction)))
+
     def interval_mm(self, start: Array, direction: Array) -> tuple[Array, Array]:
         """Where rays enter and leave, mm."""
         scale = np.reshape(self.half_axes_mm, (3,) + (1,) * (start.ndim - 1))
@@ -154,6 +166,13 @@ class Superellipsoid:
     def radius_mm(self) -> float:
         """Half the diagonal of the box around it."""
         return float(np.linalg.norm(self.half_axes_mm))
+
+    def reach_mm(self, direction: Array) -> float:
+        """How far it goes from its middle along a direction, mm."""
+        # the dual norm of the one that bounds it
+        steps = np.abs(np.multiply(self.half_axes_mm, direction))
+        power = self.exponent / (self.exponent - 1.0) if self.exponent > 1.0 else math.inf
+        return float(np.linalg.norm(steps, ord=power))
 
     def interval_mm(self, start: Array, direction: Array) -> tuple[Array, Array]:
         """Where rays enter and leave, mm, by bisection to 1e-10 of the size."""
@@ -218,6 +237,10 @@ class Box:
         """Half the diagonal."""
         return float(np.linalg.norm(self.half_sides_mm))
 
+    def reach_mm(self, direction: Array) -> float:
+        """How far it goes from its middle along a direction, mm."""
+        return float(np.abs(np.multiply(self.half_sides_mm, direction)).sum())
+
     def interval_mm(self, start: Array, direction: Array) -> tuple[Array, Array]:
         """Where rays enter and leave, mm."""
         return _slabs(start, direction, self.half_sides_mm)
@@ -250,6 +273,11 @@ class Capsule:
     def radius_mm(self) -> float:
         """Half the length."""
         return self.length_mm / 2.0
+
+    def reach_mm(self, direction: Array) -> float:
+        """How far it goes from its middle along a direction, mm."""
+        radius = self.diameter_mm / 2.0
+        return float((self.length_mm / 2.0 - radius) * abs(direction[0]) + radius)
 
     def interval_mm(self, start: Array, direction: Array) -> tuple[Array, Array]:
         """Where rays enter and leave, mm."""
@@ -303,6 +331,11 @@ class Cone:
         """Of the ball around it."""
         return math.hypot(self.length_mm / 2.0, max(self.radius_start_mm, self.radius_end_mm))
 
+    def reach_mm(self, direction: Array) -> float:
+        """How far it goes from its middle along a direction, mm."""
+        along, across = direction[0] * self.length_mm / 2.0, math.hypot(direction[1], direction[2])
+        return float(max(self.radius_start_mm * across - along, self.radius_end_mm * across + along))
+
     def interval_mm(self, start: Array, direction: Array) -> tuple[Array, Array]:
         """Where rays enter and leave, mm."""
         half = self.length_mm / 2.0
@@ -338,12 +371,21 @@ class Cone:
 class Polyhedron:
     """A convex body cut by planes: all points with normal . x <= offset (mm) for every plane.
 
-    Fields: normals (plane, 3) of length 1; offsets_mm (plane,); radius_mm of a ball around it.
+    Fields: normals (plane, 3) of length 1; offsets_mm (plane,); corners_mm (corner, 3).
     """
 
     normals: Array
     offsets_mm: Array
-    radius_mm: float
+    corners_mm: Array
+
+    @property
+    def radius_mm(self) -> float:
+        """Distance of the farthest corner from the middle."""
+        return float(np.linalg.norm(self.corners_mm, axis=1).max())
+
+    def reach_mm(self, direction: Array) -> float:
+        """How far it goes from its middle along a direction, mm."""
+        return float((self.corners_mm @ direction).max())
 
     def interval_mm(self, start: Array, direction: Array) -> tuple[Array, Array]:
         """Where rays enter and leave, mm."""
@@ -381,6 +423,13 @@ class Union:
         return max(
             float(np.linalg.norm(place)) + part.radius_mm
             for part, place in zip(self.parts, self.places_mm, strict=True)
+        )
+
+    def reach_mm(self, direction: Array) -> float:
+        """How far it goes from its middle along a direction, mm."""
+        return max(
+            float(place @ direction) + part.reach_mm(rotation.T @ direction)
+            for part, rotation, place in zip(self.parts, self.rotations, self.places_mm, strict=True)
         )
 
     def path_mm(self, start: Array, direction: Array) -> Array:

@@ -11,6 +11,10 @@ A requirement has up to four parts. Each is met where the data show it, failed w
 
 (bounds are one-sided, 95 %; intervals two-sided, 95 %)
 
+Where the hits give no a90 (all are misses, or all hits), the objects themselves decide. POD rises with size, so the share of objects
+of at least the size asked for that any network finds bounds it from above, and the share of those up to that size that all networks
+find from below (exact binomial bounds, an object each).
+
 The margin is the share of the requirement that is left at the bound, negative where the bound is beyond it: 1 - bound / asked, of
 throughput value / asked - 1. A setting meets the requirement where it meets all parts, and fails where it fails one. A setting that a
 model observer looked at in place of networks never meets it: it is likely to, where the upper end of what is expected is at most the
@@ -52,6 +56,19 @@ class Criterion:
     margin: float | None
     verdict: str
     predicted: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Looks:
+    """Objects that networks were tried on. Fields, a value an object: sizes; by_any: found by one network or more; by_all: by all of
+    them."""
+
+    sizes: tuple[float, ...] = ()
+    by_any: tuple[bool, ...] = ()
+    by_all: tuple[bool, ...] = ()
+
+
+NO_LOOKS = Looks()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,9 +123,11 @@ CHANGES = {
 # ---------------------------------------------------------------------------------------------------- verdicts
 
 
-def judge_row(row: Row, requirement: Requirement, *, changes: Sequence[Change] = ()) -> Verdict:
-    """The verdict on a row of a sweep."""
-    criteria = [_detection(row, requirement.size)]
+def judge_row(
+    row: Row, requirement: Requirement, *, changes: Sequence[Change] = (), looks: Looks = NO_LOOKS
+) -> Verdict:
+    """The verdict on a row of a sweep, whose networks had these looks."""
+    criteria = [_detection(row, requirement.size, looks)]
     if requirement.false_alarm_rate is not None:
         criteria.append(_false_alarms(row, requirement.false_alarm_rate))
     if requirement.throughput_per_s is not None:
@@ -126,13 +145,14 @@ def judge_row(row: Row, requirement: Requirement, *, changes: Sequence[Change] =
     )
 
 
-def _detection(row: Row, required: float) -> Criterion:
+def _detection(row: Row, required: float, looks: Looks) -> Criterion:
     if row["trained"]:
         value, bound, low = row["a90"], row["a90_upper"], row["a90_low"]
         failed = low is not None and low > required
         if value is None:
             # no a90 within the objects: the curve's band, or the objects themselves, say whether what is asked for is found
-            failed = min(_highest_pod(row["line"], required), _highest_rate(row["points"], required)) < _POD
+            failed = min(_highest_pod(row["line"], required), _highest_share(looks, required)) < _POD
+            bound = required if _lowest_share(looks, required) >= _POD else bound
         met = bound is not None and bound <= required
         return _criterion("detection", required, value, bound, met, failed, _left(bound, required))
     expected: Mapping[str, float] | None = row.get("predicted")
@@ -161,13 +181,16 @@ def _highest_pod(line: Mapping[str, Any] | None, size: float) -> float:
     return 1.0 if line["high"][place] is None else float(line["high"][place])
 
 
-def _highest_rate(points: Sequence[Mapping[str, Any]], size: float) -> float:
-    """Upper 95 % bound of the share of objects of a size or larger that any network finds, which no POD at that size exceeds.
-
-    Objects of the same size count as one.
-    """
-    found = [point["hits"] > 0 for point in points if point["size"] >= size]
+def _highest_share(looks: Looks, size: float) -> float:
+    """Upper 95 % bound of the share of objects of a size or larger that any network finds, which no POD at that size exceeds."""
+    found = [one for one, own in zip(looks.by_any, looks.sizes, strict=True) if own >= size]
     return upper_rate(sum(found) / len(found), float(len(found))) if found else 1.0
+
+
+def _lowest_share(looks: Looks, size: float) -> float:
+    """Lower 95 % bound of the share of objects up to a size that every network finds, which the POD at that size is not below."""
+    missed = [not one for one, own in zip(looks.by_all, looks.sizes, strict=True) if own <= size]
+    return 1.0 - upper_rate(sum(missed) / len(missed), float(len(missed))) if missed else 0.0
 
 
 def _false_alarms(row: Row, required: float) -> Criterion:
@@ -406,7 +429,8 @@ def decision_sentence(
     parts = [_COUNTED[kind][number != 1].format(number) for kind, number in count.items() if number or kind == MEETS]
     tally = f"Of {total} setting{'s' * (total != 1)} {', '.join(parts)}."
     if recommended is None:
-        none = f"None of the {tried} that were tried has an a90" if tried else "None was tried"
+        to_choose = " to choose by" if count[MEETS] else ""
+        none = f"None of the {tried} that were tried has an a90{to_choose}" if tried else "None was tried"
         return f"{asked} {tally} {none}; the reasons stand with the settings."
     facts = "; ".join(criterion_text(one, unit=unit) for one in recommended.criteria)
     if recommended.verdict == MEETS:

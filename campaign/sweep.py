@@ -21,7 +21,7 @@ from ..files import only_one, whole_file, write_json
 from ..generator.twins.twin_io import read_twin
 from ..observers import write_efficiency
 from ._plain import digest, plain, read_object
-from .decision import Change, Verdict, decide, judge_row
+from .decision import NO_LOOKS, Change, Looks, Verdict, decide, judge_row
 from .sweep_choice import choose, indistinct, pareto_front, sentence, takes_part
 from .sweep_file import Campaign, CurveOptions, Pair
 from .sweep_runners import Runner
@@ -439,7 +439,10 @@ def _answer(
     if campaign.requirement is not None:
         changes, changes_by = _changes(campaign, directory, rows, screened)
         for row in rows:
-            verdicts.append(judge_row(row, campaign.requirement, changes=changes.get(str(row["setting"]), ())))
+            looks = _looks(directory / row["folder"] / "hits.csv", campaign.curve.size) if row["trained"] else NO_LOOKS
+            verdicts.append(
+                judge_row(row, campaign.requirement, changes=changes.get(str(row["setting"]), ()), looks=looks)
+            )
             row["verdict"] = verdicts[-1].verdict
     choice = choose(rows, goal=goal, most_false_alarms=most)
     front = set(pareto_front([row if takes_part(row, most) else {**row, "a90": None} for row in rows]))
@@ -503,6 +506,23 @@ def _answer(
         "rows": rows,
     }
     return dict(plain(result))
+
+
+def _looks(table_path: Path, size: str) -> Looks:
+    """The objects of known size of a hit table, an image each, and who found them."""
+    from ..pod import read_pod_table
+
+    table = read_pod_table(table_path, size=size)
+    found: dict[str, list[float]] = {}
+    sizes: dict[str, float] = {}
+    for image, own, hit in zip(table.image or (), table.size, () if table.hits is None else table.hits, strict=True):
+        found.setdefault(image, []).append(float(hit))
+        sizes[image] = float(own)
+    return Looks(
+        sizes=tuple(sizes.values()),
+        by_any=tuple(any(hits) for hits in found.values()),
+        by_all=tuple(all(hits) for hits in found.values()),
+    )
 
 
 def _changes(

@@ -10,7 +10,9 @@ import pytest
 import raytwin.campaign
 from raytwin.api.campaigns import Decision, Sweep
 from raytwin.campaign.decision import (
+    NO_LOOKS,
     Change,
+    Looks,
     decide,
     found_of_found,
     front_of,
@@ -40,7 +42,6 @@ def row(a90=1.5, *, upper=1.8, low=1.2, alarms=0.0, looks=400.0, pace=1.5, dose=
         "a90_upper": upper if trained else None,
         "objects": 60,
         "line": None,
-        "points": [],
         "predicted": None,
         "false_alarm_rate": {"value": alarms, "low": max(alarms - spread, 0.0), "high": alarms + spread}
         | {"n": int(looks), "effective_n": looks}
@@ -56,8 +57,8 @@ def row(a90=1.5, *, upper=1.8, low=1.2, alarms=0.0, looks=400.0, pace=1.5, dose=
     }
 
 
-def verdicts(one, asked=ASKED):
-    found = judge_row(one, asked)
+def verdicts(one, asked=ASKED, looks=NO_LOOKS):
+    found = judge_row(one, asked, looks=looks)
     return found.verdict, {part.name: part.verdict for part in found.criteria}
 
 
@@ -73,11 +74,19 @@ def test_a_setting_meets_what_its_bounds_show():
 
 
 @pytest.mark.parametrize(
-    ("missed", "verdict"), [((1.0, 1.5), "open"), ((2.0,), "open"), ((2.0, 2.2, 2.5, 3.0), "fails")]
+    ("sizes", "found", "verdict"),
+    [
+        (29 * [1.5], False, "open"),
+        (28 * [2.0], False, "fails"),
+        (29 * [2.0], True, "meets"),
+        (28 * [2.0], True, "open"),
+        (29 * [2.5], True, "open"),
+    ],
 )
-def test_objects_that_nobody_finds_rule_a_size_out_where_no_curve_can(missed, verdict):
-    points = [{"size": size, "hits": 0, "n": 3} for size in missed]
-    assert verdicts(row(None, upper=None, low=None, points=points))[1]["detection"] == verdict
+def test_where_all_are_misses_or_all_hits_the_objects_themselves_decide(sizes, found, verdict):
+    """29 of 29 found up to the size asked for show 90 % with 95 % confidence; misses of larger ones rule it out."""
+    looks = Looks(sizes=tuple(sizes), by_any=(found,) * len(sizes), by_all=(found,) * len(sizes))
+    assert verdicts(row(None, upper=None, low=None), looks=looks)[1]["detection"] == verdict
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -171,7 +171,7 @@ def prepare_references(campaign: Campaign, folder: Path, basis: Mapping[str, Any
     are held back; validation products are held back where the file has none.
 
     Raises:
-        InputError: no products left to learn from or to try on, no foreign objects among them, images of another detector.
+        InputError: as `check_references`; images of another detector.
     """
     key = digest(basis)
     note = folder / "dealt.json"
@@ -179,29 +179,57 @@ def prepare_references(campaign: Campaign, folder: Path, basis: Mapping[str, Any
         return
     folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        references = stack.enter_context(open_references(campaign.references, "references"))
-        tests = None
-        if campaign.test_references is not None:
-            tests = stack.enter_context(open_references(campaign.test_references, "test_references"))
-        splits = _dealt(campaign, references, held_back=tests is None)
-        learn = [number for number, split in enumerate(splits) if split in ("train", "val")]
-        source, tried = references, [number for number, split in enumerate(splits) if split == "test"]
-        if tests is not None:
-            source, tried = tests, [int(n) for n in tests.indices(split="test")] or list(range(len(tests)))
-        for name, dataset, numbers in (("to learn from", references, learn), ("to try networks on", source, tried)):
-            found = sum(bool(dataset.rows[number].foreign_object) for number in numbers)
-            if not found:
-                raise InputError(
-                    dataset.path,
-                    received=f"{len(numbers)} images {name}, none with a foreign object",
-                    expected="images with and without foreign objects",
-                    remedy="more products, or other shares (test_share, validation_share)",
-                )
+        dealt = _deal(campaign, stack)
         note.unlink(missing_ok=True)  # what is written from here on is another campaign's until all of it is there
-        _write_dealt(references, folder / "learn.h5", learn, splits)
-        write_selected(source, folder / "test.h5", selection=tried, split="test")
+        _write_dealt(dealt.references, folder / "learn.h5", dealt.learn, dealt.splits)
+        write_selected(dealt.tests, folder / "test.h5", selection=dealt.tried, split="test")
     with whole_file(note) as temporary:
         temporary.write_bytes(canonical({"key": key}))
+
+
+def check_references(campaign: Campaign) -> None:
+    """Refuse references that leave nothing to learn from or to try on; nothing is written.
+
+    Raises:
+        InputError: files of another kind, no products left to learn from or to try on, no foreign objects among them.
+    """
+    if not campaign.described:
+        with ExitStack() as stack:
+            _deal(campaign, stack)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Dealt:
+    """References and the split of each; numbers to learn from, and of the images in tests to try networks on."""
+
+    references: Dataset
+    splits: list[str]
+    learn: list[int]
+    tests: Dataset
+    tried: list[int]
+
+
+def _deal(campaign: Campaign, stack: ExitStack) -> _Dealt:
+    """Open the reference images of a campaign and deal them out."""
+    references = stack.enter_context(open_references(campaign.references, "references"))
+    tests = None
+    if campaign.test_references is not None:
+        tests = stack.enter_context(open_references(campaign.test_references, "test_references"))
+    splits = _dealt(campaign, references, held_back=tests is None)
+    learn = [number for number, split in enumerate(splits) if split in ("train", "val")]
+    source, tried = references, [number for number, split in enumerate(splits) if split == "test"]
+    if tests is not None:
+        source, tried = tests, [int(n) for n in tests.indices(split="test")] or list(range(len(tests)))
+    for name, dataset, numbers in (("to learn from", references, learn), ("to try networks on", source, tried)):
+        found = sum(bool(dataset.rows[number].foreign_object) for number in numbers)
+        if not found:
+            raise InputError(
+                dataset.path,
+                received=f"{len(numbers)} images {name}, none with a foreign object",
+                expected="images with and without foreign objects",
+                remedy="more products, or other shares (test_share, validation_share)",
+            )
+    return _Dealt(references=references, splits=splits, learn=learn, tests=source, tried=tried)
 
 
 def _dealt(campaign: Campaign, references: Dataset, *, held_back: bool) -> list[str]:

@@ -51,6 +51,15 @@ def test_plan_trains_nothing_and_tells_what_is_known_before(campaign, capsys):
     assert "2 settings, 1 feasible, 1 to train" in text and "22.7" in text
 
 
+def test_references_that_leave_nothing_to_try_are_refused_by_plan_and_run_alike(campaign, capsys, tmp_path):
+    untried = campaign.with_name("untried.toml")
+    untried.write_text(CAMPAIGN.replace("test_share = 0.4", "test_share = 0"))
+    for words in (["--plan"], ["-o", str(tmp_path / "sweep")]):
+        assert main(["sweep", str(untried), *words]) == 2
+        assert "got 0 images to try networks on" in capsys.readouterr().err
+    assert not (tmp_path / "sweep").exists()
+
+
 @pytest.mark.slow
 def test_a_sweep_writes_its_answer_and_prints_the_same_rows_with_their_time(campaign, capsys, tmp_path):
     folder = tmp_path / "sweep"

@@ -265,6 +265,7 @@ def sweep(
         2
     """
     from ..campaign.sweep_file import Campaign, read_campaign
+    from ..campaign.sweep_trial import check_references
 
     for name, value in (("workers", workers), ("threads", threads)):
         if value < 1:
@@ -276,6 +277,7 @@ def sweep(
         if isinstance(campaign, Campaign)
         else read_campaign(given_path(campaign, expected="a campaign", argument="campaign"))
     )
+    check_references(known)
     with Telling(progress, unit="setting") as telling:
         if plan_only or output is None:
             return _plan(known, telling)

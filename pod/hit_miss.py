@@ -311,6 +311,11 @@ def sizes_from_curve(
                 f"a flat curve is within the {which} 95 % likelihood region: the data give no upper likelihood-ratio"
                 " bound on a90 (more trials, or sizes over a wider range, would)"
             )
+        if not separated and trusted_bound(low, separated=separated) is None:
+            notes.append(
+                "a flat curve above 90 % is within the two-sided 95 % likelihood region: the data give no lower likelihood-ratio"
+                " bound on a90 (more small sizes would)"
+            )
         largest_size = float(table.size.max())
         given = [value for value in (one.likelihood_ratio, one.wald, one.modified) if value is not None]
         if given and max(given) > largest_size:

@@ -140,8 +140,11 @@ def fit_lapse_pod(
                 ends.append(_root(drop90, at90, far, quantile) if held else None)
             ends.append(_root(drop90, at90, at90 - 20 * span, Z_TWO_SIDED**2))
             bound, bound_two, bound_low = (size_from_x(end, log_size=log_size) for end in ends)
-            if bound is None:
-                notes.append("a curve that never reaches 90 % is within the 95 % likelihood region: no bound on a90")
+            if bound is None or bound_two is None:
+                which, what = ("", "bound") if bound is None else ("two-sided ", "upper end of a two-sided interval")
+                notes.append(
+                    f"a curve that never reaches 90 % is within the {which}95 % likelihood region: no {what} on a90"
+                )
     gain = max(problem.deviance(np.array([*plain, 0.0, 1.0]))[0] - value, 0.0)
     return LapseFit(
         link=link,

@@ -143,12 +143,28 @@ def with_links_open(
         told += (
             "bounds of all curves that fit stand in over_links" if named else "bounds are those of all curves that fit"
         )
-        endless = [one.name for one in found if one.name in joined.curves and one.a90_95 is None]
-        if endless and not named:
-            told += (
-                f"; there are none, as {', '.join(endless)} may be right and {'have' if endless[1:] else 'has'} none"
-            )
+        if not named:
+            told += _without_bounds([one for one in found if one.name in joined.curves])
     return fit if named else _widened(fit, joined, best), joined, told
+
+
+def _without_bounds(alike: list[Alternative]) -> str:
+    """Which bounds on a90 curves that fit have not together, and for want of which of them; nothing where all are there."""
+    upper = [one.name for one in alike if one.a90_95 is None]
+    told = ""
+    for what, names in (
+        ("upper bound", upper),
+        (
+            "upper end of a two-sided interval",
+            [one.name for one in alike if one.a90_high is None and one.name not in upper],
+        ),
+        ("lower end of a two-sided interval", [one.name for one in alike if one.a90_low is None]),
+    ):
+        if names:
+            told += (
+                f"; there is no {what}, as {', '.join(names)} may be right and {'have' if names[1:] else 'has'} none"
+            )
+    return told
 
 
 def _ends_below_90(curve: Alternative) -> bool:

@@ -260,10 +260,15 @@ def test_bounds_of_a_curve_that_fits_worse_reach_as_far_as_those_of_curves_that_
     assert wide.a90_low_two_sided.modified <= true <= wide.a90_95_two_sided.modified
     assert wide.a90_95.modified == max(joined.a90_95, fit.a90_95.modified)
     # one that fits as well and has no bound leaves none, and is named
-    endless = [replace(one, a90_95=None) if one.name in joined.curves[1:2] else one for one in found]
-    without, _, told = with_links_open(fit, tuple(endless), named=False)
-    assert without.a90_95.modified is None
-    assert told.endswith(f"there are none, as {joined.curves[1]} may be right and has none")
+    for end, bounds, what in (
+        ("a90_95", "a90_95", "upper bound"),
+        ("a90_high", "a90_95_two_sided", "upper end of a two-sided interval"),
+        ("a90_low", "a90_low_two_sided", "lower end of a two-sided interval"),
+    ):
+        endless = [replace(one, **{end: None}) if one.name in joined.curves[1:2] else one for one in found]
+        without, _, told = with_links_open(fit, tuple(endless), named=False)
+        assert getattr(without, bounds).modified is None
+        assert told.endswith(f"; there is no {what}, as {joined.curves[1]} may be right and has none")
     answer = rt.fit_pod({"size": size, "hit": hit}, size="size", hit="hit")
     assert answer.to_dict()["a90_95"]["modified"] == wide.a90_95.modified
     assert any("another curve fits better" in text for text in answer.warnings)

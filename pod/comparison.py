@@ -44,12 +44,17 @@ class Interval:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CurveTest:
-    """Test that one curve serves both tables: statistic, degrees of freedom, p-value and how it was made."""
+    """Test that one curve serves both tables.
+
+    Fields: statistic, which p belongs to: chi-square on degrees_of_freedom, or F on these and denominator_degrees (None: chi-square);
+    p; kind (how it was made).
+    """
 
     statistic: float
     degrees_of_freedom: int
     p: float
     kind: str
+    denominator_degrees: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -205,6 +210,11 @@ def compare_pod(
     test = None
     if all(fit.curve is not None and not fit.separated for fit in fits):
         test = _curve_test(first, second, link=link, log_size=log_size, repeats=repeats, fits=fits, shared=pairs)
+        if test is None:
+            notes.append(
+                "no test of the whole curves: the fit of both together did not converge, or too few networks or images tell how much"
+                " they differ"
+            )
     else:
         notes.append("no test of the whole curves where one of the tables has no most likely curve")
     return Comparison(
@@ -395,7 +405,7 @@ def _curve_test(
 def _robust_test(
     first: Trials, second: Trials, both: Trials, *, fits: tuple[PodFit, ...], log_size: bool
 ) -> CurveTest | None:
-    """Wald test of equal (c0, c1) with the clustered covariance of their difference, F with few clusters.
+    """Hotelling's test of equal (c0, c1) with the clustered covariance of their difference; None below three clusters.
 
     Of the covariances by network, by image and by both the one is taken that speaks least against equality.
     """
@@ -420,12 +430,17 @@ def _robust_test(
     if not statistics:
         return None
     fewest = min(int(one.max()) + 1 for one in codes)
+    degrees = fewest - 2
+    if degrees < 1:
+        return None
     # Hotelling: T^2 (G - 2) / (2 (G - 1)) is F with 2 and G - 2 degrees of freedom
-    degrees = max(fewest - 2, 1)
-    value = max(min(statistics), 0.0)
-    p = float(fdtrc(2, degrees, value * degrees / (2 * (fewest - 1)))) if fewest > 2 else 1.0
+    value = max(min(statistics), 0.0) * degrees / (2 * (fewest - 1))
     return CurveTest(
-        statistic=value, degrees_of_freedom=2, p=p, kind=f"Wald, robust to networks and images ({fewest} clusters)"
+        statistic=value,
+        degrees_of_freedom=2,
+        denominator_degrees=degrees,
+        p=float(fdtrc(2, degrees, value)),
+        kind=f"Hotelling, robust to networks and images ({fewest} clusters)",
     )
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 
 import raytwin as rt
 from raytwin.cli import main
@@ -189,10 +190,15 @@ def test_compare_says_equivalent_different_and_paired(capsys, tmp_path):
     words[2] = str(worse)
     result = answer_of(capsys, *words, "--plots", str(tmp_path), "--json")
     assert result["verdict"] == "different"
-    assert result["curve_test"]["p"] < 0.05
+    test = result["curve_test"]
+    assert test["p"] < 0.05
     assert (tmp_path / "compare.png").exists()
     assert main(words) == 0
-    assert "different" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "different" in printed
+    # p belongs to the statistic that is printed beside it
+    assert test["p"] == pytest.approx(scipy.stats.f.sf(test["statistic"], 2, test["denominator_degrees"]))
+    assert f"F {test['statistic']:.3g} on 2 and {test['denominator_degrees']}, p = {test['p']:.3g}" in printed
 
 
 def test_compare_by_default_takes_the_effects_of_both(capsys, tmp_path):

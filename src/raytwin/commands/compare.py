@@ -89,8 +89,11 @@ def _text(result: dict[str, Any]) -> str:
         lines.append(f"{label}: {shown(found['value'])} ({shown(found['low'])} to {shown(found['high'])}, 95 %)")
     test = result["curve_test"]
     if test is not None:
+        below = test["denominator_degrees"]
+        name, ends = ("chi-square", "") if below is None else ("F", f" and {below}")
         lines.append(
-            f"one curve for both: chi-square {test['statistic']:.3g} on 2, p = {test['p']:.3g} ({test['kind']})"
+            f"one curve for both: {name} {test['statistic']:.3g} on {test['degrees_of_freedom']}{ends}, p = {test['p']:.3g}"
+            f" ({test['kind']})"
         )
     equal = result["equivalence"]
     lines.append(

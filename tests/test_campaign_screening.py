@@ -32,7 +32,7 @@ CAMPAIGN = """
 twin = "twin.h5"
 references = "references.h5"
 test_share = 0.4
-seed = 3
+seed = 8
 [grid]
 low_kv = [40, 50, 60]
 high_kv = 90

@@ -201,11 +201,12 @@ class Screen:
         outlooks: of every setting.
 
     Raises:
-        InputError: a twin without a spectral part, references that an observer cannot read, an observer of another size.
+        InputError: a twin without a spectral part, references that an observer cannot read, an observer of another size or of
+            other materials.
     """
 
     def __init__(self, campaign: Campaign, tests: Path, outlooks: Sequence[Outlook]) -> None:
-        from ..observers import LineImages, Observer, read_efficiency, sight_of_references
+        from ..observers import LineImages, Observer, materials_seen, read_efficiency, sight_of_references
 
         screening = campaign.screening or Screening()
         self.campaign, self._screening = campaign, screening
@@ -220,6 +221,7 @@ class Screen:
                     received=f"an observer calibrated for {self.efficiency.size_name}",
                     expected=f"one for {campaign.curve.size}, the size of this campaign",
                 )
+            materials_seen(self.efficiency, campaign.product_material, campaign.foreign_material)
         calibrated = None if self.efficiency is None else self.efficiency.observer
         detector = screening.detector if calibrated is None else calibrated.detector
         self.line: LineImages = LineImages(read_twin(campaign.twin))

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .efficiency import Efficiency as Efficiency
     from .efficiency import MeasuredSize as MeasuredSize
     from .efficiency import fit_efficiency as fit_efficiency
+    from .efficiency import materials_seen as materials_seen
     from .efficiency import predicted_sizes as predicted_sizes
     from .efficiency_io import read_efficiency as read_efficiency
     from .efficiency_io import write_efficiency as write_efficiency
@@ -61,6 +62,7 @@ _HOME = {
     "fit_efficiency": "efficiency",
     "frequency_bins": "frequencies",
     "independent_places": "search",
+    "materials_seen": "efficiency",
     "object_spectrum": "frequencies",
     "Sight": "reference_objects",
     "sight_of_references": "reference_objects",

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from ..acquisition.setting import Setting
 from ..errors import FitError, InputError
 from ..generator.line.twin import Z95
+from ..materials import material_from_name
 from .line_images import LineImages
 from .objects import ForeignObjects
 from .observe import SETTINGS_AT_ONCE, Observer, PreparedSettings, sizes_of_pod
@@ -34,6 +35,7 @@ FloatArray = NDArray[np.float64]
 Pair = tuple[Setting, Setting]
 
 FEWEST_SETTINGS = 4
+USUAL_MATERIALS = ("chicken_breast", "rib_bone")  # of product and foreign object, where nobody says
 _PRIOR_LOG_EFFICIENCY = 1.5
 _PRIOR_NOISE = 2.0
 _WIDEST = (6.0, 8.0)  # of the first grid: four standard deviations of the priors
@@ -86,7 +88,8 @@ class Efficiency:
 
     Fields: observer (with the fitted efficiency and internal noise); covariance of (ln efficiency, internal noise over `unit`) as
     ((a, b), (b, c)); unit (noise of the combined image, its median over settings and objects); scatter (of ln a90 between
-    settings); left_out (a row a setting); size_name.
+    settings); left_out (a row a setting); size_name; product_material, foreign_material (of what the networks looked at; None: a file
+    that does not say).
     """
 
     observer: Observer
@@ -95,6 +98,8 @@ class Efficiency:
     scatter: float
     left_out: tuple[LeftOut, ...]
     size_name: str
+    product_material: str | None = None
+    foreign_material: str | None = None
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -105,6 +110,29 @@ class Efficiency:
     def left_out_rms(self) -> float:
         """Root mean square of ln(measured / predicted) over settings that were left out."""
         return math.sqrt(float(np.mean([math.log(one.measured / one.predicted) ** 2 for one in self.left_out])))
+
+
+def materials_seen(
+    efficiency: Efficiency | None, product_material: str | None, foreign_material: str | None
+) -> tuple[str, str]:
+    """Materials of product and foreign object: those given, else the calibrated observer's, else the usual ones.
+
+    Raises:
+        InputError: others than those that the observer was calibrated with.
+    """
+    given = {"product_material": product_material, "foreign_material": foreign_material}
+    found = []
+    for (name, wanted), usual in zip(given.items(), USUAL_MATERIALS, strict=True):
+        own: str | None = None if efficiency is None else getattr(efficiency, name)
+        if own is not None and wanted is not None and material_from_name(own) != material_from_name(wanted):
+            raise InputError(
+                name,
+                received=wanted,
+                expected=f"{own}, with which the observer was calibrated",
+                remedy="calibrate it to networks that looked at the other one",
+            )
+        found.append(wanted or own or usual)
+    return found[0], found[1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -249,6 +277,8 @@ def fit_efficiency(
         scatter=scatter,
         left_out=tuple(rows),
         size_name=objects.size_name,
+        product_material=objects.product_material,
+        foreign_material=objects.foreign_material,
     )
 
 
@@ -296,6 +326,7 @@ def predicted_sizes(
             received=f"sizes as {objects.size_name}",
             expected=f"{efficiency.size_name}, by which the observer was calibrated",
         )
+    materials_seen(efficiency, objects.product_material, objects.foreign_material)
     observer = efficiency.observer
     covariance = np.array(efficiency.covariance)
     quantile = _quantile(len(efficiency.left_out))

@@ -32,6 +32,8 @@ def efficiency_to_mapping(efficiency: Efficiency) -> dict[str, Any]:
         "unit": efficiency.unit,
         "scatter": efficiency.scatter,
         "size": efficiency.size_name,
+        "product_material": efficiency.product_material,
+        "foreign_material": efficiency.foreign_material,
         "left_out": rows,
     }
 
@@ -63,6 +65,7 @@ def efficiency_from_mapping(values: Mapping[str, Any], *, where: str = "calibrat
             scatter=float(values["scatter"]),
             left_out=tuple(rows),
             size_name=str(values["size"]),
+            **{name: values.get(name) for name in ("product_material", "foreign_material")},
         )
     except (KeyError, TypeError, ValueError, InputError) as error:
         raise FileFormatError(

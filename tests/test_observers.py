@@ -23,6 +23,7 @@ from raytwin.observers import (
     fit_efficiency,
     frequency_bins,
     independent_places,
+    materials_seen,
     object_spectrum,
     objects_of_shape,
     observe_settings,
@@ -348,6 +349,7 @@ def test_a_calibrated_observer_is_read_back_as_written(line, tmp_path):
     found = fit_efficiency(line, measured[:5], objects, observer=Observer(false_alarm_rate=0.05))
     write_efficiency(tmp_path / "observer.json", found)
     assert read_efficiency(tmp_path / "observer.json") == found
+    assert (found.product_material, found.foreign_material) == (objects.product_material, objects.foreign_material)
     (tmp_path / "other.json").write_text("[1]")
     with pytest.raises(FileFormatError, match="raytwin-observer"):
         read_efficiency(tmp_path / "other.json")
@@ -358,6 +360,19 @@ def test_a_calibrated_observer_is_read_back_as_written(line, tmp_path):
         read_efficiency(tmp_path / "cut.json")
     with pytest.raises(InputError, match="4 or more"):
         fit_efficiency(line, measured[:3], objects, observer=Observer())
+
+
+def test_a_calibrated_observer_looks_at_the_materials_it_was_calibrated_with(line):
+    objects = rods(line, sizes=np.geomspace(0.6, 28.0, 10), turns_deg=[0.0])
+    measured = measured_sizes(line, objects, np.random.default_rng(3), scatter=0.1, error=0.05)
+    found = fit_efficiency(line, measured[:5], objects, observer=Observer(false_alarm_rate=0.05))
+    jam = dataclasses.replace(found, product_material="C2.103H8.297O4.148@1.30", foreign_material="glass")
+    assert materials_seen(jam, None, None) == ("C2.103H8.297O4.148@1.30", "glass")
+    assert materials_seen(dataclasses.replace(found, product_material=None), None, None)[0] == "chicken_breast"
+    with pytest.raises(InputError, match="with which the observer was calibrated"):
+        materials_seen(jam, "chicken_breast", None)
+    with pytest.raises(InputError, match="with which the observer was calibrated"):
+        predicted_sizes(line, PAIRS[:1], objects, jam)
 
 
 def test_a_setting_that_the_line_cannot_have_gets_no_number(line, make_model_twin):

@@ -146,8 +146,8 @@ def observe(
     sizes_mm: Sequence[float] | None = None,
     displaces: bool = False,
     references: "Dataset | PathLike | None" = None,
-    product_material: str = "chicken_breast",
-    foreign_material: str = "rib_bone",
+    product_material: str | None = None,
+    foreign_material: str | None = None,
     size: str = "contrast",
     detector: str | None = None,
     image: str | None = None,
@@ -171,14 +171,15 @@ def observe(
         sizes_mm: lengths to look at; None: from half a pixel to 120 pixels or the field's shorter side.
         displaces: the shape takes the product's place.
         references: in place of a shape: a dataset of low-noise images, whose objects are looked for (they take the product's place).
-        product_material, foreign_material, size: of the references; size is `contrast` or `size_mm`.
+        product_material, foreign_material: of the references; None: as `calibrated` was calibrated, else chicken_breast, rib_bone.
+        size: of the references, `contrast` or `size_mm`.
         detector: `ideal` (default), `hotelling`, `npw` or `npwe`; image: `residual` (default of a shape), `quotient`, `low`,
             `high` or `both` (default of references, where detector and texture of the product allow it).
         false_alarm_rate: share of images without object that show an alarm; default 0.01.
         calibrated: of `calibrate_observer`, or its file; it brings detector, image and false alarms along.
 
     Raises:
-        InputError: no settings, materials that are not known, neither product nor references, or both.
+        InputError: no settings, materials that are not known or not those of `calibrated`, neither product nor references, or both.
 
     Source: ICRU Report 54 (1996); Barrett & Myers, Foundations of Image Science (2004), ch. 13.
 
@@ -192,7 +193,7 @@ def observe(
     import numpy as np
 
     from ..generator.predictions.contrast import check_pair
-    from ..observers import LineImages, Observer, Sight, observe_settings, predicted_sizes
+    from ..observers import LineImages, Observer, Sight, materials_seen, observe_settings, predicted_sizes
 
     pairs = _pairs(settings)
     line = LineImages(as_twin(twin))
@@ -228,11 +229,12 @@ def observe(
         )
         sight = Sight(objects=objects, image=observer.image, texture=None)
     else:
+        materials = materials_seen(efficiency, product_material, foreign_material)
         sight = _sight_of_file(
             line,
             references,
-            product_material=product_material,
-            foreign_material=foreign_material,
+            product_material=materials[0],
+            foreign_material=materials[1],
             size=size,
             detector=observer.detector,
             image=observer.image if efficiency is not None else image,

@@ -39,10 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--product-material",
         metavar="MATERIAL",
-        help="of the references (default chicken_breast; of --networks the sweep's)",
+        help="of the references (default chicken_breast; of --networks the sweep's, of --calibrated the observer's)",
     )
     add(
-        "--foreign-material", metavar="MATERIAL", help="of the references (default rib_bone; of --networks the sweep's)"
+        "--foreign-material",
+        metavar="MATERIAL",
+        help="of the references (default rib_bone; of --networks the sweep's, of --calibrated the observer's)",
     )
     add("--size", default="contrast", choices=("contrast", "size_mm"), help="of the references (default contrast)")
     add("--detector", help="ideal (default), hotelling, npw or npwe")

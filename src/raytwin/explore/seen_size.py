@@ -20,6 +20,7 @@ from ..observers import (
     Observer,
     ProductTexture,
     Shape,
+    materials_seen,
     objects_of_shape,
     observe_settings,
     predicted_sizes,
@@ -67,21 +68,22 @@ def read_networks_observer(
     references: str,
     twin: Twin,
     *,
-    product_material: str = "chicken_breast",
-    foreign_material: str = "rib_bone",
+    product_material: str | None = None,
+    foreign_material: str | None = None,
 ) -> NetworksObserver:
-    """A calibrated observer with the objects of a dataset.
+    """A calibrated observer with the objects of a dataset, of the materials with which it was calibrated.
 
     Raises:
         InputError, FileFormatError: no such files, other kinds of files.
     """
     efficiency = read_efficiency(path)
+    product, foreign = materials_seen(efficiency, product_material, foreign_material)
     with read_dataset(references) as dataset:
         sight = sight_of_references(
             LineImages(twin),
             dataset,
-            product_material=product_material,
-            foreign_material=foreign_material,
+            product_material=product,
+            foreign_material=foreign,
             size=efficiency.size_name,
             detector=efficiency.observer.detector,
             image=efficiency.observer.image,

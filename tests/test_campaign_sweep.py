@@ -20,7 +20,7 @@ from raytwin.campaign import sweep_trial
 from raytwin.campaign.sweep import Progress, compare_tables, look_ahead, run_sweep
 from raytwin.campaign.sweep_choice import Choice, choose, indistinct, paces, pareto_front, sentence
 from raytwin.campaign.sweep_file import CurveOptions, read_campaign, text_of_pair
-from raytwin.campaign.sweep_report import write_report
+from raytwin.campaign.sweep_report import by_upper_bound, write_report
 from raytwin.campaign.sweep_runners import DaskCluster, Processes, _tried
 from raytwin.campaign.sweep_settings import Outlook, keep_best, labels_of, start_pair
 from raytwin.campaign.sweep_trial import run_task, seed_of
@@ -357,6 +357,11 @@ def test_a_folder_of_something_else_and_a_second_run_are_refused(line, whole, tm
 
 
 @pytest.mark.slow
+def test_settings_without_an_a90_stand_by_their_numbers():
+    rows = [{"a90": None, "a90_upper": None, "label": f"40/90 kV, {ms} ms"} for ms in ("100", "5", "20", "10", "2.5")]
+    assert [row["label"].split()[2] for row in by_upper_bound(rows)] == ["2.5", "5", "10", "20", "100"]
+
+
 def test_the_report_shows_every_setting(line, whole):
     folder, answer = whole
     campaign = read_campaign(line / "campaign.toml")

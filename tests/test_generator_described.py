@@ -160,6 +160,23 @@ def test_objects_lie_inside_away_from_the_edge_and_from_each_other(tmp_path_fact
     assert (foreign > 0).sum() > 0
 
 
+def test_in_a_tilted_plate_a_rod_fits_between_its_faces(tmp_path, twin):
+    sizes = "length_mm = 18\nwidth_mm = 14\nheight_mm = 5\n"
+    plate = f'[[product]]\nshape = "box"\nmaterial = "Al"\n{sizes}orientation = "any"\n'
+    rod = '[[foreign_object]]\nshape = "rod"\nmaterial = "Fe"\nlength_mm = 7\ndiameter_mm = 0.8\n'
+    description = described(tmp_path, plate + rod + "[images]\nwith_foreign_object = 1\n")
+    field = geometry_of(twin, settings=(LOW, HIGH), line=description.line).rays()
+    tilts = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        product = sample_individual(description.products[0], name="p", rng=rng)
+        scene = sample_scene(description, product, rays=field, rng=rng)
+        normal, along = scene.product.rotation[:, 2], scene.foreign_objects[0].rotation[:, 0]
+        assert 6.2 * abs(normal @ along) + 0.8 < 5.0
+        tilts.append(abs(normal[2]))
+    assert min(tilts) < 0.8
+
+
 def test_an_object_inside_is_nowhere_higher_than_the_product_is_thick(tmp_path, twin):
     """Rods longer than their plate is thick lie flat enough; seen from the side, their shadow is no higher than the plate."""
     from raytwin.generator.scenes.shapes import Rays, path_lengths_mm

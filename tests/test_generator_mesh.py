@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from raytwin.errors import FileFormatError, InputError
 from raytwin.generator.scenes.describe import read_description, sample_individual, sample_scene
 from raytwin.generator.scenes.mesh import Mesh, read_mesh
-from raytwin.generator.scenes.shapes import Box, Ellipsoid, Rays, path_lengths_mm, sample_rotation
+from raytwin.generator.scenes.shapes import Box, Ellipsoid, Rays, levels_mm, path_lengths_mm, sample_rotation
 
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-0.5, 0.5) for z in (-2.0, 2.0)])
 FACES = [
@@ -82,6 +82,10 @@ def test_a_mesh_of_a_block_is_the_block_for_every_ray(seed):
     found = Mesh(corners_mm=block()).lengths_mm(field, rotation=turn, place_mm=place)
     expected = path_lengths_mm(Box(half_sides_mm=(1.0, 0.5, 2.0)), field, rotation=turn, place_mm=place)
     np.testing.assert_allclose(found, expected, atol=1e-9)
+    levels = Mesh(corners_mm=block()).levels_mm(field, rotation=turn, place_mm=place)
+    of_block = levels_mm(Box(half_sides_mm=(1.0, 0.5, 2.0)), field, rotation=turn, place_mm=place)
+    crossed = expected > 1e-6
+    np.testing.assert_allclose(np.array(levels)[:, crossed], np.array(of_block)[:, crossed], atol=1e-6)
 
 
 def test_rays_through_edges_and_corners_are_counted_once():

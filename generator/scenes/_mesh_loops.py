@@ -25,10 +25,11 @@ def _left_of(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> 
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def add_lengths(corners: Any, source: float, x_mm: Any, y_mm: Any, total: Any) -> None:
+def add_lengths(corners: Any, source: float, x_mm: Any, y_mm: Any, total: Any, first: Any, last: Any) -> None:
     """Add to total (row, column) the signed distances along rays from (0, 0, -source) at which triangles are met.
 
-    Leaving counts positive and entering negative, so that a closed surface sums to the length inside it. corners
+    Leaving counts positive and entering negative, so that a closed surface sums to the length inside it. first and last (row, column)
+    become the smallest and largest distance, where they were larger and smaller. corners
     (triangle, 3, 3) in mm, seen from outside counter-clockwise; x_mm and y_mm rise in even steps.
     """
     x_step, y_step = x_mm[1] - x_mm[0], y_mm[1] - y_mm[0]
@@ -66,3 +67,5 @@ def add_lengths(corners: Any, source: float, x_mm: Any, y_mm: Any, total: Any) -
                     continue
                 distance = away / slope * math.sqrt(x * x + y * y + source * source)
                 total[row, column] += distance if slope > 0.0 else -distance
+                first[row, column] = min(first[row, column], distance)
+                last[row, column] = max(last[row, column], distance)

@@ -66,6 +66,7 @@ from .shapes import (
     Rays,
     Shape,
     layer_lengths_mm,
+    levels_mm,
     path_lengths_mm,
     rotation_about_z,
     sample_rotation,
@@ -399,6 +400,17 @@ class Placed:
             return float(thickness_mm.max())
         return body.reach_mm(self.rotation[2]) + body.reach_mm(-self.rotation[2])
 
+    def levels_mm(self, rays: Rays) -> tuple[Array, Array]:
+        """z (row, column) in mm where rays first enter and last leave; layers lie evenly about their plane."""
+        body = self.individual.body
+        if body is None:
+            half = 0.5 * np.sum(list(self.lengths_mm(rays).values()), axis=0) / rays.secant()
+            return -half, half
+        place = np.array([*self.place_mm, 0.0])
+        if isinstance(body, Mesh):
+            return body.levels_mm(rays, rotation=self.rotation, place_mm=place)
+        return levels_mm(body, rays, rotation=self.rotation, place_mm=place)
+
     def lengths_mm(self, rays: Rays) -> dict[str, Array]:
         """Path lengths (row, column) by material, mm."""
         one = self.individual
@@ -513,6 +525,7 @@ def place_foreign_object(
     individual: Individual,
     *,
     product_mm: Array,
+    levels_mm: tuple[Array, Array],
     taken: NDArray[np.bool_],
     rays: Rays,
     images: Mapping[str, Range],
@@ -520,9 +533,10 @@ def place_foreign_object(
 ) -> tuple[Placed, NDArray[np.bool_]]:
     """A foreign object at a random place in the product, and its footprint (row, column).
 
+    product_mm: path lengths through the product; levels_mm: where rays enter and leave it.
     Refused and tried again: a place nearer to the product's outline than `distance_from_edge_mm`, nearer to another object
-    than `distance_between_mm`, beyond the field, or, for one inside, where the product is anywhere thinner than the whole object is
-    high: within the product at one depth, wherever its surfaces lie.
+    than `distance_between_mm`, beyond the field, or, for one inside, where no layer of the product across the beam, as thick as the
+    whole object is high, covers it.
 
     Raises:
         InputError: no place was found.
@@ -547,7 +561,8 @@ def place_foreign_object(
         rim = footprint[0].any() or footprint[-1].any() or footprint[:, 0].any() or footprint[:, -1].any()
         if rim or from_edge[footprint].min() <= needed or from_others[footprint].min() <= apart:
             continue
-        if inside and placed.height_mm(lengths / secant) > thickness[footprint].min() * (1.0 + _ROUNDING):
+        layer = min(levels_mm[1][footprint].min() - levels_mm[0][footprint].max(), thickness[footprint].min())
+        if inside and placed.height_mm(lengths / secant) > layer * (1.0 + _ROUNDING):
             continue
         return placed, footprint
     deep = f" (at most {thickness.max():.3g} mm thick)" if inside else ""
@@ -574,12 +589,12 @@ def sample_scene(description: Description, product: Individual, *, rays: Rays, r
     objects: list[Placed] = []
     if rng.random() < images["with_foreign_object"][0]:
         count = int(rng.integers(round(images["objects"][0]), round(images["objects"][1]) + 1))
-        taken = np.zeros(rays.shape, dtype=bool)
+        taken, levels = np.zeros(rays.shape, dtype=bool), placed.levels_mm(rays)
         for _ in range(count):
             kind = choose_kind(description.foreign_objects, rng)
             one = sample_individual(kind, name=kind.name, rng=rng)
             found, footprint = place_foreign_object(
-                one, product_mm=lengths, taken=taken, rays=rays, images=images, rng=rng
+                one, product_mm=lengths, levels_mm=levels, taken=taken, rays=rays, images=images, rng=rng
             )
             objects.append(found)
             taken |= footprint

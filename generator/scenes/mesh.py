@@ -49,6 +49,21 @@ class Mesh:
         Raises:
             InputError: the mesh reaches behind the source.
         """
+        total, _, _ = self._crossed(rays, rotation, place_mm)
+        return np.maximum(total, 0.0)
+
+    def levels_mm(self, rays: Rays, *, rotation: Array, place_mm: Array) -> tuple[Array, Array]:
+        """z (row, column) in mm where rays first enter and last leave the mesh; those that miss it enter after they leave.
+
+        Raises:
+            InputError: the mesh reaches behind the source.
+        """
+        _, first, last = self._crossed(rays, rotation, place_mm)
+        secant = rays.secant()
+        return first / secant - rays.source_mm, last / secant - rays.source_mm
+
+    def _crossed(self, rays: Rays, rotation: Array, place_mm: Array) -> tuple[Array, Array, Array]:
+        """Length inside, and distances from the source of the first and last triangle (row, column), mm."""
         from ._mesh_loops import add_lengths
 
         corners = np.ascontiguousarray(self.corners_mm @ np.asarray(rotation).T + np.asarray(place_mm))
@@ -59,9 +74,9 @@ class Mesh:
                 expected=f"less than {rays.source_mm:g} mm, the source",
                 remedy="state scale_mm, the mm of one unit of the file",
             )
-        total = np.zeros(rays.shape)
-        add_lengths(corners, rays.source_mm, rays.x_mm[0].copy(), rays.y_mm[:, 0].copy(), total)
-        return np.maximum(total, 0.0)
+        total, first, last = np.zeros(rays.shape), np.full(rays.shape, np.inf), np.full(rays.shape, -np.inf)
+        add_lengths(corners, rays.source_mm, rays.x_mm[0].copy(), rays.y_mm[:, 0].copy(), total, first, last)
+        return total, first, last
 
 
 def read_mesh(path: Path, *, scale: float = 1.0) -> Mesh:

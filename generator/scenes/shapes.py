@@ -82,6 +82,10 @@ class Shape(Protocol):
         """How far the shape goes from its middle along a direction (3,) of length 1."""
         ...
 
+    def interval_mm(self, start: Array, direction: Array) -> tuple[Array, Array]:
+        """Where rays first enter and last leave (s in mm); leaving before entering is missing the shape."""
+        ...
+
     def path_mm(self, start: Array, direction: Array) -> Array:
         """Path lengths (mm) of rays start + s direction, s in mm from -infinity; arrays (3, ...)."""
         ...
@@ -432,16 +436,26 @@ class Union:
             for part, rotation, place in zip(self.parts, self.rotations, self.places_mm, strict=True)
         )
 
-    def path_mm(self, start: Array, direction: Array) -> Array:
-        """Path lengths, mm: where parts overlap the ray is counted once."""
+    def _of_parts(self, start: Array, direction: Array) -> tuple[Array, Array]:
+        """Where rays enter and leave each part (part, ...), mm."""
         intervals = []
         for part, rotation, place in zip(self.parts, self.rotations, self.places_mm, strict=True):
             moved = start - np.reshape(place, (3,) + (1,) * (start.ndim - 1))
             intervals.append(
                 part.interval_mm(np.tensordot(rotation.T, moved, axes=1), np.tensordot(rotation.T, direction, axes=1))
             )
-        entry = np.stack([one for one, _ in intervals])
-        leave = np.stack([one for _, one in intervals])
+        entry, leave = (np.stack(ends) for ends in zip(*intervals, strict=True))
+        hit = entry < leave
+        return np.where(hit, entry, _FAR), np.where(hit, leave, -_FAR)
+
+    def interval_mm(self, start: Array, direction: Array) -> tuple[Array, Array]:
+        """Where rays first enter and last leave, mm."""
+        entry, leave = self._of_parts(start, direction)
+        return entry.min(axis=0), leave.max(axis=0)
+
+    def path_mm(self, start: Array, direction: Array) -> Array:
+        """Path lengths, mm: where parts overlap the ray is counted once."""
+        entry, leave = self._of_parts(start, direction)
         order = np.argsort(entry, axis=0)
         entry, leave = np.take_along_axis(entry, order, axis=0), np.take_along_axis(leave, order, axis=0)
         total = np.zeros(entry.shape[1:])
@@ -585,19 +599,30 @@ def path_lengths_mm(shape: Shape, rays: Rays, *, rotation: Array, place_mm: Arra
         place_mm: (x, y, z) of its middle.
     """
     result = np.zeros(rays.shape)
-    rows, columns = rays.window(np.asarray(place_mm, dtype=np.float64), shape.radius_mm)
-    part = rays.part(rows, columns)
-    if 0 in part.shape:
-        return result
-    x, y = np.broadcast_arrays(part.x_mm, part.y_mm)
+    window = rays.window(np.asarray(place_mm, dtype=np.float64), shape.radius_mm)
+    part = rays.part(*window)
+    if 0 not in part.shape:
+        result[window] = shape.path_mm(*_seen_by(part, rotation=rotation, place_mm=place_mm))
+    return result
+
+
+def levels_mm(shape: Shape, rays: Rays, *, rotation: Array, place_mm: Array) -> tuple[Array, Array]:
+    """z (row, column) in mm where rays first enter and last leave a shape that was turned and then moved; as `path_lengths_mm`.
+
+    Rays that miss it enter after they leave.
+    """
+    entry, leave = shape.interval_mm(*_seen_by(rays, rotation=rotation, place_mm=place_mm))
+    return entry / rays.secant(), leave / rays.secant()
+
+
+def _seen_by(rays: Rays, *, rotation: Array, place_mm: Array) -> tuple[Array, Array]:
+    """Points of rays in the object's plane and their directions (3, row, column), in coordinates of a shape."""
+    x, y = np.broadcast_arrays(rays.x_mm, rays.y_mm)
     to_plane = np.stack([x, y, np.full(x.shape, rays.source_mm)])
     direction = to_plane / np.linalg.norm(to_plane, axis=0)
     # from the middle of the crossing on, so that coordinates stay small
     start = np.stack([x, y, np.zeros(x.shape)]) - np.reshape(place_mm, (3, 1, 1))
-    result[rows, columns] = shape.path_mm(
-        np.tensordot(rotation.T, start, axes=1), np.tensordot(rotation.T, direction, axes=1)
-    )
-    return result
+    return np.tensordot(rotation.T, start, axes=1), np.tensordot(rotation.T, direction, axes=1)
 
 
 def layer_lengths_mm(

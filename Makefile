@@ -97,7 +97,7 @@ validation-prediction: $(READY)
 
 # the diagnosis on sessions of other programs, a quarter of an hour a line (gvxr and gecatsim are installed apart; without one its lines are left out)
 validation-simulators: $(READY)
-	for line in usual coarse hard soft three even counting; do OMP_NUM_THREADS=1 $(BIN)/python validation/second_simulator.py --line $$line --json build/second_simulator_$$line.json || exit 1; done
+	for line in usual coarse hard soft three even counting threshold; do OMP_NUM_THREADS=1 $(BIN)/python validation/second_simulator.py --line $$line --json build/second_simulator_$$line.json || exit 1; done
 	for line in csi gos "flat panel"; do OMP_NUM_THREADS=1 $(BIN)/python validation/catsim_sessions.py --line "$$line" --json "build/catsim_$$line.json" || exit 1; done
 	for line in curved points areas; do OMP_NUM_THREADS=1 $(BIN)/python validation/gvxr_sessions.py --line $$line --json build/gvxr_$$line.json || exit 1; done
 	$(BIN)/python validation/export_in_simulators.py --json build/export_in_simulators.json

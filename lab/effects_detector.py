@@ -334,6 +334,37 @@ def _pile_up(request: Asked, site: Site) -> Planted:
     )
 
 
+_THRESHOLD_KEV, _COMPARATOR_KEV = (
+    20.0,
+    0.8,
+)  # below the lowest voltage, above electronic noise; width of a comparator's step
+
+
+def _threshold_error(request: Asked, site: Site) -> Planted:
+    """A comparator that lets go of what leaves little more than its threshold."""
+    higher_keV = _THRESHOLD_KEV + request.strength
+
+    def miss(rates: FineRates, exposure: Exposure) -> FineRates:
+        lower, higher = (
+            0.5 * (1.0 + np.tanh((rates.deposit_keV - at) / (2.0 * _COMPARATOR_KEV)))
+            for at in (_THRESHOLD_KEV, higher_keV)
+        )
+        left = (rates.rates * (1.0 - (lower - higher))).astype(np.float32)
+        return replace(
+            fine_rates(rates.cell, left, rates.deposit_keV, load_mAs=rates.load_mAs),
+            remote=rates.remote,
+            remote_keV=rates.remote_keV,
+        )
+
+    return _told(
+        request,
+        "a counter that no longer counts photons of 20 keV to so much more, its step a logistic curve",
+        {"threshold_keV": _THRESHOLD_KEV, "width_keV": _COMPARATOR_KEV},
+        rates=miss,
+        in_screen=True,
+    )
+
+
 # --- drift ------------------------------------------------------------------------------------------------------------
 
 
@@ -520,5 +551,14 @@ DETECTOR_LAWS: tuple[EffectLaw, ...] = (
 MEMORY_LAWS: tuple[EffectLaw, ...] = (
     _law("burn_in", "a screen that light makes brighter", "%", (0.05, 5.0), _burn_in),
     _law("pile_up", "pulses that pile up", "ns", (10.0, 1000.0), _pile_up, drawn=False),
+    _law(
+        "threshold_error",
+        "a threshold that rose",
+        "keV",
+        (0.2, 8.0),
+        _threshold_error,
+        since="calibration",
+        drawn=False,
+    ),
 )
 DETECTOR_UNITS = {law.id: law.unit for law in (*DETECTOR_LAWS, *MEMORY_LAWS)}

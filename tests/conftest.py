@@ -148,6 +148,42 @@ def series_line():
 
 
 @pytest.fixture(scope="session")
+def as_counter():
+    """Called with a twin that adds up energies: the same with the spectrum of a counter from 20 keV on; of a counter, itself."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from raytwin.generator.line.spectral_signal import SHARED_CHARGE, THRESHOLD, SpectralModel
+
+    made = {}
+
+    def counter(twin):
+        if twin.instrument.counting:
+            return twin
+        if id(twin) not in made:
+            known = twin.spectral
+            model = SpectralModel(
+                filter_materials=("Al", "Cu"), scintillator=known.scintillator, cover=known.cover, counting=True
+            )
+            best = model.default_parameters()
+            for name, value in zip(known.names, known.best, strict=True):
+                if name in model.names:
+                    best[model.names.index(name)] = value
+            # a count is what 40 keV were
+            for name, value in ((THRESHOLD, 20.0), (SHARED_CHARGE, 0.2)):
+                best[model.names.index(name)] = value
+            best[model.names.index("log_DN_per_keV")] += np.log(40.0)
+            samples = np.repeat(best[None], len(known.samples), axis=0)
+            spectral = replace(known, names=model.names, best=best, samples=samples, counting=True)
+            instrument = replace(twin.instrument, counting=True)
+            made[id(twin)] = twin, replace(twin, instrument=instrument, spectral=spectral)
+        return made[id(twin)][1]
+
+    return counter
+
+
+@pytest.fixture(scope="session")
 def make_model_twin():
     """A twin set by hand whose measured levels, 40 and 90 kV behind 50 um Cu, are those of its own spectral model.
 

@@ -185,8 +185,8 @@ def test_darks_alone_test_only_what_darks_can_show(diagnosed, line):
     assert code == 0
     assert answer["verdict"] == "no_gap"
     assert {"object_scatter", "kv_error", "focal_spot", "nonlinearity"} <= untested(answer)
-    # the instrument states counting = false: no session of this line can have pile-up
-    assert not {"row_noise", "dark_drift", "quantisation", "pile_up"} & untested(answer)
+    # the instrument states counting = false: no session of this line can have pile-up or a threshold
+    assert not {"row_noise", "dark_drift", "quantisation", "pile_up", "threshold_error"} & untested(answer)
     assert all(cause["probability"] < 0.5 for cause in answer["causes"])
 
 

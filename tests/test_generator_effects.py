@@ -68,6 +68,7 @@ CATALOGUE = {
     "random_telegraph": ("%", 0.1, 10),
     "burn_in": ("%", 0.05, 5),
     "pile_up": ("ns", 10, 1000),
+    "threshold_error": ("keV", 0.2, 8),
 }
 CACHE = ModelCache()
 
@@ -119,13 +120,15 @@ def state_with(bends):
 COUNTERS = {}
 
 
+@pytest.fixture(autouse=True, scope="module")
+def counters(as_counter):
+    """How a line is made a counter."""
+    COUNTERS["made"] = as_counter
+
+
 def line_for(line, effects):
     """The line, as a counter where only counters can have an effect."""
-    if not any(item.id == "pile_up" for item in effects):
-        return line
-    if id(line) not in COUNTERS:
-        COUNTERS[id(line)] = line, replace(line, instrument=replace(line.instrument, counting=True))
-    return COUNTERS[id(line)][1]
+    return COUNTERS["made"](line) if any("counting" in EFFECTS[item.id].needs for item in effects) else line
 
 
 def expect(line, asked, effects=(), cache=CACHE):
@@ -191,8 +194,9 @@ LATER = {
 @pytest.mark.parametrize("name", EFFECTS)
 @pytest.mark.parametrize("asked", [request(**BEHIND, **LATER), request(**LATER), request("dark", setting=None)])
 def test_strength_zero_is_no_effect_at_all(series_line, name, asked):
-    none = expect(series_line, asked)
-    zero = expect(series_line, asked, applied(name, 0.0))
+    line = line_for(series_line, applied(name))
+    none = expect(line, asked)
+    zero = expect(line, asked, applied(name, 0.0))
     np.testing.assert_array_equal(numbers(zero), numbers(none))
 
 
@@ -223,7 +227,8 @@ def test_effects_are_smooth_in_every_fitted_parameter(series_line, name):
 def test_an_effect_that_came_after_calibration_leaves_the_calibrating_series_alone(series_line, name):
     before = request(**BEHIND, after_calibration=False)
     effect = applied(name, since="calibration")
-    np.testing.assert_array_equal(numbers(expect(series_line, before, effect)), numbers(expect(series_line, before)))
+    line = line_for(series_line, effect)
+    np.testing.assert_array_equal(numbers(expect(line, before, effect)), numbers(expect(line, before)))
 
 
 def test_the_order_in_which_effects_are_given_does_not_matter(series_line):
@@ -1470,6 +1475,34 @@ def test_a_parameter_that_no_line_can_have_is_refused(series_line, name, wrong):
     (parameter,) = wrong
     with pytest.raises(InputError, match=f"{parameter} of {name}: got"):
         expect(series_line, request(**BEHIND, source_object_mm=850.0), applied(name, **wrong))
+
+
+def test_a_threshold_error_is_the_model_at_the_other_threshold(series_line, as_counter):
+    """One pixel's variance stays that of counts."""
+    line = as_counter(series_line)
+    model, before = spectral_model_of(line), line.spectral.best
+    for setting in (MEASURED, SOFT):
+        asked = request(setting=setting)
+        for moved_keV in (5.0, -5.0, -30.0):
+            after = before.copy()
+            after[model.names.index("threshold_keV")] = max(20.0 + moved_keV, 0.0)
+            beam = OpenBeam(kV=asked.setting.kV, filters=asked.setting.filters)
+            rates = model.signal(np.stack([before, after]), beam).rate_DN_per_mAs
+            found, plain = expect(line, asked, applied("threshold_error", moved_keV)), expect(line, asked)
+            share = found.signal_DN / plain.signal_DN
+            np.testing.assert_allclose(share, rates[1] / rates[0], rtol=1e-6)
+            np.testing.assert_allclose(found.quantum_variance_DN2 / plain.quantum_variance_DN2, share, rtol=1e-6)
+            assert (share < 1.0).all() == (moved_keV > 0)
+
+
+def test_a_threshold_that_no_counter_has_is_refused(series_line, as_counter):
+    with pytest.raises(InputError, match="only counters have a threshold"):
+        LineModel(series_line, effects=applied("threshold_error")).expect(request())
+    counting = replace(series_line, instrument=replace(series_line.instrument, counting=True))
+    with pytest.raises(InputError, match="a twin whose spectrum has no threshold"):
+        LineModel(counting, effects=applied("threshold_error")).expect(request())
+    with pytest.raises(InputError, match=r"strength of threshold_error: got 61 keV on top of a calibrated 20 keV"):
+        LineModel(as_counter(series_line), effects=applied("threshold_error", 61.0)).expect(request())
 
 
 def test_only_counters_lose_counts(series_line):

@@ -71,12 +71,12 @@ def fine_moments(twin, setting, thickness_mm):
 
 @pytest.mark.parametrize("effect", sorted(set(EFFECTS) - set(NOT_IN_IMAGES) - {"kv_error", "filtration_error"}))
 @pytest.mark.parametrize("size", ["weak", "usual", "strong", "beyond"])
-def test_the_mean_picture_with_any_effect_is_that_of_the_series_model(series_line, effect, size):
+def test_the_mean_picture_with_any_effect_is_that_of_the_series_model(series_line, as_counter, effect, size):
     known = EFFECTS[effect].strength
     strength = {"weak": known.low, "usual": known.default, "strong": known.high, "beyond": 1.8 * known.high}[size]
     applied = AppliedEffect(id=effect, parameters={"strength": strength}, since="calibration")
-    if effect == "pile_up":
-        series_line = replace(series_line, instrument=replace(series_line.instrument, counting=True))
+    if "counting" in EFFECTS[effect].needs:
+        series_line = as_counter(series_line)
     thickness = hill()
     effects = channel(series_line, [applied]).image_effects
     asked = SeriesRequest(
@@ -431,11 +431,11 @@ def test_a_reference_twin_without_spectrum_says_which_effects_are_left_out(serie
     ]
 
 
-def test_every_effect_of_the_catalogue_has_its_place_in_images(series_line, fillets):
+def test_every_effect_of_the_catalogue_has_its_place_in_images(series_line, as_counter, fillets):
     for name in EFFECTS:
         applied = AppliedEffect(id=name, parameters={}, since="calibration")
-        counter = replace(series_line.instrument, counting=name == "pile_up" or None)
-        line = replace(series_line, instrument=counter, effects=(applied,))
+        line = as_counter(series_line) if "counting" in EFFECTS[name].needs else series_line
+        line = replace(line, effects=(applied,))
         scenes = DescribedScenes(line, fillets, low=LOW, high=HIGH, seed=1)
         told = [line for line in scenes.warnings if name in line]
         assert bool(told) == (name in NOT_IN_IMAGES), (name, told, effect_of(applied).needs)

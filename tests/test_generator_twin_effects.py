@@ -71,11 +71,11 @@ def test_excess_noise_raises_the_quantum_variance_by_its_strength_and_leaves_the
 @pytest.mark.parametrize("setting", [MEASURED, UNMEASURED], ids=["measured", "unmeasured"])
 @pytest.mark.parametrize("size", ["weak", "strong", "beyond"])
 def test_a_prediction_with_any_effect_is_what_the_series_model_expects_of_a_long_flat(
-    make_model_twin, effect, setting, size
+    make_model_twin, as_counter, effect, setting, size
 ):
     twin = make_model_twin((24, 24), readout_ms=2.0)
-    if effect == "pile_up":
-        twin = replace(twin, instrument=replace(twin.instrument, counting=True))
+    if "counting" in EFFECTS[effect].needs:
+        twin = as_counter(twin)
     known = EFFECTS[effect].strength
     strength = {"weak": known.low, "strong": known.high, "beyond": 1.8 * known.high}[size]
     applied = AppliedEffect(id=effect, parameters={"strength": strength}, since="calibration")

@@ -562,6 +562,16 @@ def test_piled_up_pulses_are_lost_as_by_a_dead_time_that_each_prolongs():
     assert seen[1] == pytest.approx(math.exp(-0.2), rel=1e-5) and seen[0] == pytest.approx(1.0 - 2e-4, rel=1e-5)
 
 
+def test_a_threshold_that_rose_loses_the_photons_between_both():
+    line, bare = (line_with(effect, system=system_on("coarse")) for effect in ("threshold_error=6", None))
+    seen, all_of = (one.arrivals(setting_of(one, 60.0)) for one in (line, bare))
+    left = seen.rates[0] / all_of.rates[0]
+    between = (all_of.deposit_keV > 22.5) & (all_of.deposit_keV < 23.5)
+    apart = (all_of.deposit_keV > 32.0) | (all_of.deposit_keV < 14.0)
+    assert left[between].max() < 0.06 and left[apart].min() > 0.99
+    assert seen.totals[0] == pytest.approx(seen.rates[0].sum(), rel=1e-5)
+
+
 def test_lost_frames_are_copies_of_the_last_good_one_of_their_series():
     line = line_with("dropped_frames=20", seed=3)
     shown = []

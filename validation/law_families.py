@@ -20,6 +20,7 @@ from unittest.mock import patch
 import numpy as np
 import second_simulator as plain
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates, shift
+from scipy.special import ndtr
 
 from raytwin.acquisition import open_acquisition
 from raytwin.diagnosis.diagnose_session import diagnose
@@ -54,6 +55,7 @@ FAMILIES: dict[str, tuple[str, ...]] = {
     "random_telegraph": ("three levels", "heights that fall exponentially"),
     "burn_in": ("two kinds of traps", "fades as a power of time"),
     "pile_up": ("prolonged by each photon", "pixels of unlike dead times"),
+    "threshold_error": ("pixels of unlike shifts", "in proportion to unlike thresholds", "of more noise"),
 }
 # what the plain simulator has no law of: a middling strength (unit of the catalogue)
 ADDED = {
@@ -105,6 +107,7 @@ class FamilyLine(plain.Line):
         self.slow_pixels = np.ones(self.of.shape)
         if self._is("pile_up", "pixels of unlike dead times"):
             self.slow_pixels = np.exp(0.2 * self.law.standard_normal(self.of.shape))
+        self.unlike = self.law.standard_normal((*self.of.shape, 1)) if "threshold_error" in self.effects else 0.0
         self.seen: list[np.ndarray] = []
         self.walk = 0.0
         self.taken = 0
@@ -176,6 +179,17 @@ class FamilyLine(plain.Line):
             wide = np.pad(source, 200)
             return exponential(wide, (8.0 + 12.0 * self.u["b"]) / pixel_mm)[200:-200, 200:-200]
         return super().scattered(source)
+
+    def counted(self, energies: np.ndarray, moved_keV: float) -> np.ndarray:
+        at_keV, width_keV = self.of.threshold_keV, plain.COMPARATOR_KEV
+        if self._is("threshold_error", "pixels of unlike shifts"):
+            return ndtr((energies - at_keV - moved_keV * (1.0 + 0.3 * self.unlike)) / width_keV)
+        if self._is("threshold_error", "in proportion to unlike thresholds"):
+            own_keV = at_keV * (1.0 + 0.03 * self.unlike)
+            return ndtr((energies - own_keV * (1.0 + moved_keV / at_keV)) / width_keV)
+        if self._is("threshold_error", "of more noise") and moved_keV:
+            return ndtr((energies - at_keV - moved_keV) / (2.0 * width_keV))
+        return super().counted(energies, moved_keV)
 
     def open_light(self, kV: float, mAs: float, copper_mm: float, on: dict) -> tuple[np.ndarray, np.ndarray]:
         if "kv_error" in on and self._is("kv_error", "with ripple"):

@@ -1,14 +1,14 @@
 """Diagnoses of sessions that another, plain simulator makes: one planted effect each, two, and none.
 
-The simulator shares no code with the twin or the virtual lab but the file format. It does share xraylib's cross sections with
-the twin, so that wrong attenuation tables are not tried here, and SpekPy, of which it takes another model and table (`kqp`,
-NIST). A panel that adds up energies, Gaussian noise of the compound Poisson's variance, objects sampled at points (no pixel is
-cut by an edge), a Gaussian spread, no times; five lines of other pixels, distances, beams and scintillators (`LINES`), a panel
-whose pixels are all alike and see no farther than themselves (`even`), one that counts (`counting`: darks of zeros), and any
-number of lines of which all is drawn (`random`). Its effects are laws of its own: scatter and tails are Gaussians, glare is two
-of them, lag is one exponential, the focal spot a Gaussian, drift is white, tiles are steps of gain; K photons are caught under
-two Gaussians, a moving object is seen in nine places, a heel is a wedge of tungsten, displaced objects have shifted path
-lengths.
+The simulator shares no code with the twin or the virtual lab but the file format. It does share xraylib's cross sections
+with the twin, so that wrong attenuation tables are not tried here, and SpekPy, of which it takes another model and table
+(`kqp`, NIST). A panel that adds up energies, Gaussian noise of the compound Poisson's variance, objects sampled at points
+(no pixel is cut by an edge), a Gaussian spread, no times; five lines of other pixels, distances, beams and scintillators
+(`LINES`), a panel whose pixels are all alike and see no farther than themselves (`even`), two that count (`counting`: darks
+of zeros; `threshold`: from 20 keV on, as declared), and any number of lines of which all is drawn (`random`). Its effects
+are laws of its own: scatter and tails are Gaussians, glare is two of them, lag is one exponential, the focal spot a
+Gaussian, drift is white, tiles are steps of gain; K photons are caught under two Gaussians, a moving object is seen in nine
+places, a heel is a wedge of tungsten, displaced objects have shifted path lengths.
 
     python validation/second_simulator.py --seed 1 --json build/second_simulator.json
     python validation/second_simulator.py --line coarse
@@ -31,6 +31,7 @@ from pathlib import Path
 import numpy as np
 import xraylib
 from scipy.ndimage import gaussian_filter, shift
+from scipy.special import ndtr
 
 from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
@@ -50,7 +51,7 @@ class LineOf:
     bits; DN_per_keV; photons: scale of SpekPy's; scintillator: material and mm; edge_keV, line_keV: its K edge and K line; lag_s;
     pause_s (between series); readout_ms; current_mA by kV, copper_times: of it behind copper; anode_deg; beryllium_mm; wedge_mm,
     water_mm, lead_mm: a step, the slab, the edge; counting: numbers of photons instead of their energies, and darks of zeros;
-    even: all pixels alike; declared: whether the scintillator and what filters the beam are.
+    threshold_keV: from where on they count; even: all pixels alike; declared: whether the scintillator and what filters the beam are.
     """
 
     shape: tuple[int, int]
@@ -78,6 +79,7 @@ class LineOf:
     water_mm: float
     lead_mm: float
     counting: bool = False
+    threshold_keV: float = 0.0
     even: bool = False
     declared: bool = True
 
@@ -279,6 +281,8 @@ LINES = {
         counting=True,
     ),
 }
+LINES["threshold"] = dataclasses.replace(LINES["counting"], threshold_keV=20.0)
+COMPARATOR_KEV = 1.0  # standard deviation of a pulse's height
 ALWAYS = (
     "object_scatter",
     "veiling_glare",
@@ -318,6 +322,7 @@ CASES = {
     "composition_error": (5.0, True),
     "tiles": (0.5, False),
     "wandering_tiles": (0.4, False),
+    "threshold_error": (2.0, True),
 }
 PAIRS = (
     "image_lag+kv_error",
@@ -338,11 +343,13 @@ NOT_OF_COUNTS = (
     "dark_drift",
     "k_fluorescence",
 )  # electronics' and energies', of which numbers of photons are free
+OF_THRESHOLDS = ("threshold_error",)  # of counters that have one
 
 
 def cases_of(of: LineOf) -> list[str]:
     """Effects, and pairs of them, that a line can have."""
-    return [case for case in (*CASES, *PAIRS) if not (of.counting and set(case.split("+")) & set(NOT_OF_COUNTS))]
+    never = {*(NOT_OF_COUNTS if of.counting else ()), *(() if of.threshold_keV else OF_THRESHOLDS)}
+    return [case for case in (*CASES, *PAIRS) if not set(case.split("+")) & never]
 
 
 def attenuation_per_mm(material: str, energies_keV: np.ndarray) -> np.ndarray:
@@ -470,7 +477,7 @@ def random_line(seed: int) -> str:
 def random_cases(seed: int) -> list[str]:
     """No effect, two single ones, and a pair."""
     rng = np.random.default_rng([98, seed])
-    single = rng.choice([case for case in CASES if case != "none"], 2, replace=False)
+    single = rng.choice([case for case in CASES if case not in ("none", *OF_THRESHOLDS)], 2, replace=False)
     return ["none", *map(str, single), str(rng.choice(PAIRS))]
 
 
@@ -527,11 +534,17 @@ class Line:
         """The panel's spread of light; mode: what lies beyond its borders."""
         return gaussian_filter(image, self.of.spread_px, mode=mode)
 
+    def counted(self, energies: np.ndarray, moved_keV: float) -> np.ndarray:
+        """Share of the photons (row, column, energy) or (energy,) that a counter counts whose threshold has moved."""
+        return ndtr((energies - self.of.threshold_keV - moved_keV) / COMPARATOR_KEV)
+
     def open_light(self, kV: float, mAs: float, copper_mm: float, on: dict) -> tuple[np.ndarray, np.ndarray]:
         """Energies, keV, and photons (row, column, energy) that the panel absorbs of an exposure of the open field."""
         voltage = kV * self.kV_share * (1.0 + on.get("kv_error", 0.0) / 100.0)
         energies, photons = spectrum(self.name, voltage, self.aluminium_mm + on.get("filtration_error", 0.0), copper_mm)
         arriving = photons * mAs * self.illumination[..., None]
+        if self.of.threshold_keV:
+            arriving = arriving * self.counted(energies, on.get("threshold_error", 0.0))
         if "heel" in on:
             tungsten = attenuation_per_mm("W", energies)
             signal = photons if self.of.counting else photons * energies
@@ -685,6 +698,7 @@ def make_session(
         pixel_mm=of.pixel_mm,
         detector="area",
         counting=of.counting,
+        threshold_keV=of.threshold_keV or None,
         scintillator=filters_from_text(scintillator) if of.declared else (),
         bits=of.bits,
         readout_ms=of.readout_ms if of.declared else None,

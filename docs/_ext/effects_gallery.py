@@ -55,6 +55,22 @@ def example_line() -> Any:
     return replace(twin, instrument=instrument, effects=())
 
 
+def as_counter(twin: Any) -> Any:
+    """The line with a counter that counts from 20 keV on; a count is what 40 keV were."""
+    from raytwin.generator.line.spectral_signal import THRESHOLD, SpectralModel
+    from raytwin.generator.line.twin_spectrum import spectral_posterior_of
+
+    known = spectral_posterior_of(twin)
+    model = SpectralModel(
+        filter_materials=("Al", "Cu"), scintillator=known.scintillator, cover=known.cover, counting=True
+    )
+    values = {**dict(zip(known.names, known.best, strict=True)), THRESHOLD: 20.0}
+    values["log_DN_per_keV"] += math.log(40.0)
+    best = np.array([values.get(name, 0.0) for name in model.names])
+    spectral = replace(known, names=model.names, best=best, samples=best[None], counting=True)
+    return replace(twin, instrument=replace(twin.instrument, counting=True), spectral=spectral)
+
+
 def example_series(shape: tuple[int, int]) -> dict[str, Any]:
     """Series in which an effect may show, in words -> request."""
     from raytwin.acquisition.setting import setting_from_text
@@ -136,8 +152,6 @@ def signature(
     frames, and by the change of the variance of frame differences; the larger of the two counts.
     """
     best: tuple[float, str, dict[str, Any]] | None = None
-    if "counting" in effect.needs:
-        twin = replace(twin, instrument=replace(twin.instrument, counting=True))
     for words, request in series.items():
         before, mean, sd = usual[words]
         frames = [before, sampled(twin, request, (applied(effect),))]
@@ -213,7 +227,9 @@ def effects_page(folder: Path) -> None:
 
     twin = example_line()
     series = example_series(twin.maps.shape)
-    usual = without_effects(twin, series)
+    lines = {
+        counting: (line, without_effects(line, series)) for counting, line in ((False, twin), (True, as_counter(twin)))
+    }
     parts = [
         "# Gallery of effects",
         "Every effect that the twin can carry and `raytwin diagnose` can name. Each is one change of the forward model at one"
@@ -226,11 +242,12 @@ def effects_page(folder: Path) -> None:
         + "\n".join(map(overview_row, EFFECTS.values())),
     ]
     for effect in EFFECTS.values():
-        words, found = signature(twin, series, usual, effect)
+        line, usual = lines["counting" in effect.needs]
+        words, found = signature(line, series, usual, effect)
         draw(found, folder / "effects" / f"{effect.id}.png")
         title = effect.title[0].upper() + effect.title[1:]
         onset = "after the calibration" if effect.after_calibration else "present when the line was calibrated"
-        lines = [
+        told = [
             f"(effect-{effect.id})=\n## {title}",
             f"`{effect.id}` acts {STAGE.get(effect.stage, effect.stage)}. Usual onset: {onset}.",
             f"$$\n{effect.law}\n$$",
@@ -240,5 +257,5 @@ def effects_page(folder: Path) -> None:
             f"**Isolated by** {effect.isolated_by}.",
             f"**Source** {effect.reference}.",
         ]
-        parts += lines
+        parts += told
     write_if_changed(folder / "effects_gallery.md", "\n\n".join(parts) + "\n")

@@ -52,6 +52,7 @@ from .pile_up import PILE_UP
 from .quantisation import QUANTISATION
 from .random_telegraph import RANDOM_TELEGRAPH
 from .row_noise import ROW_NOISE
+from .threshold_error import THRESHOLD_ERROR
 from .tile_gain import TILE_GAIN
 from .veiling_glare import VEILING_GLARE
 
@@ -88,6 +89,7 @@ OURS: dict[str, Effect] = {
         RANDOM_TELEGRAPH,
         BURN_IN,
         PILE_UP,
+        THRESHOLD_ERROR,
     )
 }
 EFFECTS = Catalogue(OURS)

@@ -14,7 +14,7 @@ from raytwin.lab.chain import SUBPIXELS, FrameContext
 from raytwin.lab.effect import Site
 from raytwin.lab.effects import plant
 from raytwin.lab.effects_detector import TRAP_TIMES_S, lag_of_signals
-from raytwin.lab.line import Line
+from raytwin.lab.line import Line, fine_rates
 from raytwin.lab.objects import Slab, pixel_means, thickness_on_fine_grid
 from raytwin.lab.phantoms import Edge, Posed
 from raytwin.lab.session import COPPER, GEOMETRIES, make_session, session_system
@@ -563,13 +563,12 @@ def test_piled_up_pulses_are_lost_as_by_a_dead_time_that_each_prolongs():
 
 
 def test_a_threshold_that_rose_loses_the_photons_between_both():
-    line, bare = (line_with(effect, system=system_on("coarse")) for effect in ("threshold_error=6", None))
-    seen, all_of = (one.arrivals(setting_of(one, 60.0)) for one in (line, bare))
-    left = seen.rates[0] / all_of.rates[0]
-    between = (all_of.deposit_keV > 22.5) & (all_of.deposit_keV < 23.5)
-    apart = (all_of.deposit_keV > 32.0) | (all_of.deposit_keV < 14.0)
-    assert left[between].max() < 0.06 and left[apart].min() > 0.99
-    assert seen.totals[0] == pytest.approx(seen.rates[0].sum(), rel=1e-5)
+    miss = planted("threshold_error=6", system=system_on("coarse")).rates
+    deposit_keV = np.array([10.0, 20.0, 23.0, 26.0, 40.0])
+    cell = np.zeros((SIZE, SIZE), dtype=np.int32)
+    seen = miss(fine_rates(cell, np.full((1, 5), 8.0, np.float32), deposit_keV, load_mAs=2.0), None)
+    np.testing.assert_allclose(seen.rates[0] / 8.0, [1.0, 0.5, 0.05, 0.5, 1.0], atol=0.01)
+    assert seen.load_mAs == 2.0 and seen.totals[0] == pytest.approx(seen.rates[0].sum(), rel=1e-5)
 
 
 def test_lost_frames_are_copies_of_the_last_good_one_of_their_series():

@@ -313,6 +313,7 @@ def test_what_flats_or_darks_show_and_calibration_takes_in_only_in_part_is_tried
         "random_telegraph",
         "mtf_tail",
         "grey_absorber",
+        "threshold_error",
     }
     for name, effect in EFFECTS.items():
         if "flat" not in effect.shows.series:

@@ -150,9 +150,11 @@ def _weighed(
         strong, leaves = log_odds_of_leak(observed, pair)
         if any(observed.has(effect) for effect in pair.effects if effect != strong):
             continue
-        # as it is once that is taken off
+        # as it is once that is taken off; what is left of it beyond doubt is a misfit
         alone = _of_fits((strong,), {strong: pair.fits[strong]}, found.log_evidence + leaves)
-        alone = replace(alone, misfit=found.misfit)
+        (weak,) = (fit for effect, fit in pair.fits.items() if effect != strong)
+        shows = pair.log_evidence > singles[strong].log_evidence + _NEAR
+        alone = replace(alone, misfit=found.misfit or (_place_of(weak, families) if shows else ""))
         if alone.log_evidence > leaks.get(strong, singles[strong]).log_evidence:
             leaks[strong] = alone
     weighed += [(item, of_single) for item in leaks.values()]
@@ -286,6 +288,12 @@ class Misfits:
             any_strength = another and self._any_strength(point.curve.effect)
             total += log_prior(others, point, another=another, any_strength=any_strength)
         return total
+
+
+def _place_of(fit: CurveFit, families: Families) -> str:
+    """The family of probes that an effect moves most."""
+    moved = np.bincount(families.of, weights=fit.curve.response(fit.best) ** 2, minlength=len(families.names))
+    return families.names[int(np.argmax(moved))]
 
 
 def _of_fits(effects: tuple[str, ...], fits: Mapping[str, CurveFit], log_evidence: float) -> Hypothesis:

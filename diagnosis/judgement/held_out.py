@@ -17,16 +17,21 @@ from ..problem.problem import Problem, SeriesView
 from .strengths import strengths_on
 
 _DRAWS = 300
+_MOST_TESTED = 0.5  # of what an explanation does, as a share of its squares
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gap:
-    """Root mean square of standardised residuals on held-out probes, 1 = noise: before and after, and the floor."""
+    """Root mean square of standardised residuals on held-out probes, 1 = noise: before and after, and the floor.
+
+    tested: most of what is named shows where others tell its strength well enough to remove it.
+    """
 
     before: float
     after: float
     floor: float
     shrinks_by: tuple[float, float, float] | None
+    tested: bool = True
 
     @property
     def at_floor(self) -> bool:
@@ -129,6 +134,8 @@ def held_out(
     effects = [effect for effect in leading.effects if effect != UNKNOWN]
     alone = {effect: np.full(size, np.nan) for effect in effects}
     noise = np.ones(size)
+    power = _power(problem, leading)
+    told = 0.0
     for fold in (0, 1):
         fit = folds != fold
         held = ~fit
@@ -137,6 +144,9 @@ def held_out(
         before[held], sd = left_over(problem, fit)
         # what a repeat of the same measurement would show: counting noise, of all that nuisances fitted there allow
         noise[held] = problem.noise[held] / sd
+        # what others leave open of the strength would be noise there
+        if power[held].sum() <= held.sum() * power[fit].sum():
+            told += float(power[held].sum())
         strengths = strengths_on(problem, leading, effects, fit)
         added = [
             Point(curve=leading.variants[effect], strength=strengths[effect], level=leading.levels[effect])
@@ -166,8 +176,21 @@ def held_out(
         after=_rms(after),
         floor=floor,
         shrinks_by=shrinkage_of(before, after, floor, series, rng) if effects else None,
+        tested=told >= _MOST_TESTED * float(power.sum()),
     )
     return gap, tuple(rows), shares
+
+
+def _power(problem: Problem, leading: Hypothesis) -> NDArray[np.float64]:
+    """How far what is named moves each probe (probe,), by its law and by what it has in common by chance: squared deviations."""
+    total = np.zeros(len(problem.residual))
+    nuisances = LocalNuisances(problem.factors, problem.blocks)
+    for effect, curve in leading.variants.items():
+        strength = leading.strengths[effect][0]
+        total += nuisances.given_others(curve.response(strength)) ** 2
+        if curve.spread is not None:
+            total += strength**2 * np.sum(curve.spread**2, axis=1)
+    return total
 
 
 def _rms(values: NDArray[np.float64]) -> float:

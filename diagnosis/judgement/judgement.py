@@ -59,15 +59,14 @@ def judge(
     lasting = [effect for effect in named if not leading.variants[effect].variant.series]
     added = tuple(applied_at_best(problem, leading, effect) for effect in lasting)
     ambiguous = verdict.word == "ambiguous"
-    beside = replace(problem, residual=_left(problem, leading))
     return Diagnosis(
         verdict=verdict.word,
         hypotheses=verdict.hypotheses,
-        causes=_causes(problem, verdict, shares | likeliest, _places(beside, nuisances)),
+        causes=_causes(problem, verdict, shares | likeliest, _places_left(problem, leading)),
         probability_no_gap=next((item.probability for item in verdict.hypotheses if not item.effects), 0.0),
         probability_unknown=marginal.get(UNKNOWN, 0.0),
         unknown_location=next((item.location for item in verdict.hypotheses if item.effects == (UNKNOWN,)), ""),
-        where=_places(problem, nuisances),
+        where=_places(problem, nuisances.given_others(problem.residual)),
         threshold_z=_threshold(len(problem.residual)),
         gap=gap,
         held_out=by_axis,
@@ -325,9 +324,22 @@ def _signed(sign: float, strength: tuple[float, float, float]) -> tuple[float, f
     return value, min(low, high), max(low, high)
 
 
-def _places(problem: Problem, nuisances: LocalNuisances) -> tuple[Place, ...]:
-    """Probes that depart beyond `_threshold` once the nuisances took their part, the farthest first."""
-    z = nuisances.given_others(problem.residual)
+def _places_left(problem: Problem, leading: Hypothesis) -> tuple[Place, ...]:
+    """Probes that depart with what is named added, beyond what that does by chance."""
+    factors, own = [problem.factors], np.ones(len(problem.residual))
+    for effect, curve in leading.variants.items():
+        strength = leading.strengths[effect][0]
+        if curve.spread is not None:
+            factors.append(strength * curve.spread)
+        if curve.jitter is not None:
+            own += strength**2 * curve.jitter
+    root = np.sqrt(own)
+    nuisances = LocalNuisances(np.concatenate(factors, axis=1) / root[:, None], problem.blocks)
+    return _places(problem, nuisances.given_others(_left(problem, leading) / root))
+
+
+def _places(problem: Problem, z: NDArray[np.float64]) -> tuple[Place, ...]:
+    """Probes whose z (probe,), once the nuisances took their part, lies beyond `_threshold`, the farthest first."""
     threshold = _threshold(len(problem.residual))
     return tuple(
         Place(

@@ -65,8 +65,10 @@ def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[
         found = _output_rms(problem, hypothesis, effect)
     elif reading.map_rms:
         found = _map_rms(problem, hypothesis, effect)
-    if found is None and reading.map_rms:
-        read_sd = None  # single pixels alone tell it
+    elif reading.last_dark:
+        found = _last_dark(problem, hypothesis, effect)
+    if found is None and (reading.map_rms or reading.last_dark):
+        read_sd = None  # single pixels, or other series, alone tell it
     if found is None and reading.sd is not None and curve.exact is not None and bool(curve.exact.any()):
         found = _outright(problem, hypothesis, effect)
     value, low, high = hypothesis.strengths[effect] if found is None else found
@@ -188,6 +190,39 @@ def _map_rms(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[flo
         return None
     low, middle, high = (100.0 * math.sqrt(one) for one in (value - Z95 * sd, value, value + Z95 * sd))
     return middle, low, high
+
+
+def _last_dark(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:
+    """The strength at which the last dark of the longest exposure has its level, and its 95 % interval.
+
+    None: there is no dark that does not calibrate, or other effects, noise and darks that repeat as they do leave nothing of it.
+    """
+    darks = [
+        (view.session.request.exposure_ms, view.session.request.start_s, number)
+        for number, view in enumerate(problem.views)
+        if view.session.series.kind == "dark" and not view.session.calibrates
+    ]
+    if not darks:
+        return None
+    number = max(darks)[2]
+    view = problem.views[number]
+    others = [one for one in hypothesis.effects if one != effect]
+    best = hypothesis.strengths[effect][0]
+
+    def moved_DN(effects: Sequence[str]) -> float:
+        if not effects:
+            return 0.0
+        applied = [_applied(problem, hypothesis, one, hypothesis.strengths[one][0]) for one in effects]
+        return mean_over(map_changes(problem, applied)[number], view.mask)
+
+    of_others, of_one = moved_DN(others), moved_DN([effect]) / best
+    if of_one == 0.0:
+        return None
+    value = (mean_over(view.residual_DN, view.mask) - of_others) / of_one
+    frames = math.sqrt(_noise_of_a_frame(view) / view.summary.frames)
+    off = max((EFFECTS[one].reading.law_sd for one in others), default=0.0) * abs(of_others)
+    reach = Z95 * math.hypot(scales.DARK_SD_DN, frames, off) / abs(of_one)
+    return (value, value - reach, value + reach) if value > reach else None
 
 
 def _noise_variance(view: SeriesView) -> Map:

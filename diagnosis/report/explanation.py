@@ -15,6 +15,7 @@ _NAMED = 3
 _NAMED_UNTESTED = 8  # names alone are shorter
 _NAMED_FAMILIES = 4
 _RIVALS, _LEAST_LIKELY = 5, 0.05  # explanations that are named where none leads
+_UNTESTED = "It shows in series that no others tell the strength of, so that no held-out data could test it."
 _MOSTLY = 0.5  # of the gap above noise, from which what takes so much explains it
 _FINDING_TITLES = {
     FindingCode.STOPS: "Numbers are cut off early",
@@ -127,7 +128,9 @@ def lead_text(diagnosis: Diagnosis) -> str:
         return verdict_text(diagnosis)
     place = diagnosis.where[0]
     told = [f"The gap is clearest in the {axis_text(place.axis)} of {place.series}."]
-    if gap.at_floor:
+    if not gap.tested:
+        told.append(_UNTESTED)
+    elif gap.at_floor:
         told.append(
             f"Over all probes of series that the fit did not use, the gap was at its floor of {gap.floor:.2f} already:"
             f" {gap.before:.2f}, and {gap.after:.2f} with what was found added to the twin."
@@ -135,7 +138,7 @@ def lead_text(diagnosis: Diagnosis) -> str:
     else:
         ends = f"the gap on series that the fit did not use, {gap.before:.2f} (1: noise alone), {_falls(gap)}"
         told.append(f"With what was found added to the twin, {ends}.")
-    return " ".join([*told, *_no_better(gap), *_left(diagnosis)])
+    return " ".join([*told, *([] if not gap.tested else _no_better(gap)), *_left(diagnosis)])
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -160,7 +163,7 @@ def _headline_of_verdict(diagnosis: Diagnosis) -> str:
         names = [title for title, _ in rivals(diagnosis)[:3]]
         return _sentence(f"{' or '.join(names)}: these data cannot distinguish them")
     named = _sentence(" and ".join(f"{title_of(cause.effect)}, {strength_text(cause)}" for cause in diagnosis.leading))
-    if not (diagnosis.gap.falls or diagnosis.gap.at_floor):
+    if diagnosis.gap.tested and not (diagnosis.gap.falls or diagnosis.gap.at_floor):
         return f"{named}: most like it, but the gap does not fall"
     if diagnosis.verdict == "explained":
         return named
@@ -184,18 +187,18 @@ def _causes(diagnosis: Diagnosis) -> Table:
             f"{cause.probability:.2f}",
             strength_text(cause),
             f"in {len(cause.series)} series" if cause.series else when_text(cause),
-            share_text(cause.shrinks_by) or "-",
+            (diagnosis.gap.tested and share_text(cause.shrinks_by)) or "-",
         )
         for cause in diagnosis.leading
     )
-    header = ("effect", "probability", "strength (95 %)", "when", "gap removed")
+    header = ("effect", "probability", "strength (95 %)", "when", "removed")
     return Table(title=f"{_relation(diagnosis.gap)}:", header=header, rows=rows)
 
 
 def _relation(gap: Gap) -> str:
     """What effects that are named are to the gap."""
     share = None if gap.shrinks_by is None else gap.shrinks_by[0]
-    if gap.at_floor:
+    if gap.at_floor or not gap.tested:
         return "Observed there"
     if gap.falls and (share is None or share > _MOSTLY):
         return "It is explained by"
@@ -235,6 +238,8 @@ def _not_explained(diagnosis: Diagnosis) -> list[str]:
 def _fall(diagnosis: Diagnosis) -> list[str]:
     """What becomes of the gap once what is named is added, a sentence each."""
     gap = diagnosis.gap
+    if not gap.tested:
+        return [f"{_figures(gap)}.", _UNTESTED, *_left(diagnosis)]
     text = f"{_figures(gap)}{',' if gap.at_floor else ' and'} {_falls(gap)} once that is added"
     if gap.falls and gap.shrinks_by is not None:
         value, low, high = (min(one, 1.0) for one in gap.shrinks_by)

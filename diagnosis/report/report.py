@@ -160,7 +160,7 @@ def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
         ]
     if diagnosis.verdict == "ambiguous":
         return [*measured, *_confirmed_by(diagnosis.causes[:3])]
-    if not (diagnosis.gap.falls or diagnosis.gap.at_floor):
+    if diagnosis.gap.tested and not (diagnosis.gap.falls or diagnosis.gap.at_floor):
         return [
             step(
                 "Keep the twin as it was: the gap on series that the fit did not use does not fall with the improved twin beside"

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..line.line_state import FloatArray, LineContext, LineState
-from .effect import EVERY_SERIES, Effect, Grid, InImages, Parameter, Shows, Variation
+from .effect import EVERY_SERIES, Effect, Grid, InImages, Parameter, Reading, Shows, Variation
 
 
 def _drift_dark(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -96,5 +96,7 @@ DARK_DRIFT = Effect(
     absorbed="nothing",
     grid=Grid(shares=(0.8,)),
     variation=Variation(random="sides"),
+    # a mean dark says its level outright; its course between darks is the law's
+    reading=Reading(sd=0.0, last_dark=True),
     images=InImages(left_out="it depends on the time in a session"),
 )

@@ -140,7 +140,7 @@ class Reading:
     Fields: law_sd: relative standard deviation of strengths found by the fit, as lines depart from the law; probes: those that the
     strength is defined by, where no law can be far off; sd: relative, of a strength read from these alone (None: it is fitted; 0:
     no other effect makes any of them); frame_levels (it is the rms of the frames' levels); map_rms (it is the rms over the pixels of
-    what changed in later flats).
+    what changed in later flats); last_dark (it is the level of the last dark of the longest exposure).
     """
 
     law_sd: float = 0.12
@@ -148,6 +148,7 @@ class Reading:
     sd: float | None = None
     frame_levels: bool = False
     map_rms: bool = False
+    last_dark: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,6 +25,7 @@ from raytwin.segmentation.training_step import TrainingStep
 
 SHAPE = (96, 128)
 BATCH = 8
+SCALING = "matched:45"  # any direction costs the same
 
 
 def images_and_masks(n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -97,8 +98,8 @@ def main() -> None:
     images, masks = images_and_masks(BATCH * given.steps)
     device = given.device
     networks = {
-        "same_network": RECIPES["raytwin"],
-        "starter_network": dataclasses.replace(starter_recipe(), batch=BATCH),
+        "same_network": dataclasses.replace(RECIPES["raytwin"], scaling=SCALING),
+        "starter_network": dataclasses.replace(starter_recipe(), scaling=SCALING, batch=BATCH),
     }
     work: dict[str, Callable[[], float]] = {"plain": partial(plain_seconds, images, masks, device)}
     for name, recipe in networks.items():

@@ -228,6 +228,7 @@ def starter_training_recipe(plan: Mapping[str, Any]) -> "Recipe":
     return dataclasses.replace(
         RECIPES["raytwin"],
         name="starter",
+        scaling="residual",  # its foreign objects are of many materials: no direction is all of theirs
         architecture=words["architecture"],
         encoder=words["encoder"],
         encoder_depth=words["encoder_depth"],

@@ -72,7 +72,7 @@ def train_on_file(
         tell: shows one line of progress.
         name: what the lines call these networks.
     """
-    from ..segmentation import train_networks
+    from ..segmentation import say_who_is_blind, train_networks
     from .ensemble import train_together
 
     def progress(network: int, done: int, wanted: int, result: "EpochResult | None") -> None:
@@ -88,9 +88,12 @@ def train_on_file(
             "progress": progress,
         }
         if workers is None:
-            train_networks(dataset, folder, **words)
+            found = train_networks(dataset, folder, **words)
         else:
-            train_together(dataset, folder, workers=workers, **words)
+            found = train_together(dataset, folder, workers=workers, **words)
+    blind = say_who_is_blind(found)
+    if blind:
+        tell(f"{name}: {blind}")
 
 
 def thresholds_from_images(

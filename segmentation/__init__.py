@@ -8,6 +8,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .channels import NoiseChannels, measure_direction, noise_channels
     from .detection import (
         DETECTION_RECALL,
         MARK_THRESHOLD,
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from .network import build_network, choose_device
     from .own_module import build_module, recipe_for_module
     from .recipe import RECIPES, Recipe, recipe_for_fine_tuning
-    from .runs import detect_with_networks, split_for_training, train_networks
+    from .runs import detect_with_networks, say_who_is_blind, split_for_training, train_networks
     from .runs_io import (
         NetworkResult,
         Runs,
@@ -35,12 +36,21 @@ if TYPE_CHECKING:
         read_weights,
         recipe_of_start,
     )
-    from .scaling import SCALINGS, crop_to_shape, pad_to_multiple, scale_min_max, scale_residual
+    from .scaling import (
+        SCALINGS,
+        crop_to_shape,
+        pad_to_multiple,
+        scale_matched,
+        scale_min_max,
+        scale_residual,
+        scaling_named,
+    )
     from .segmenters import Segmenter, detect_with_segmenters, segmenter_from_module, segmenter_from_onnx
     from .training import EpochResult, TrainingState, count_epochs, iterate_training, learning_rate_at
     from .weights_io import STARTER_PATH, read_safetensors, starter_recipe, write_safetensors
 
 _LAZY = {
+    "channels": ("NoiseChannels", "measure_direction", "noise_channels"),
     "detection": (
         "DETECTION_RECALL",
         "MARK_THRESHOLD",
@@ -58,7 +68,7 @@ _LAZY = {
     "network": ("build_network", "choose_device"),
     "own_module": ("build_module", "recipe_for_module"),
     "recipe": ("RECIPES", "Recipe", "recipe_for_fine_tuning"),
-    "runs": ("detect_with_networks", "split_for_training", "train_networks"),
+    "runs": ("detect_with_networks", "say_who_is_blind", "split_for_training", "train_networks"),
     "runs_io": (
         "NetworkResult",
         "Runs",
@@ -68,7 +78,15 @@ _LAZY = {
         "read_weights",
         "recipe_of_start",
     ),
-    "scaling": ("SCALINGS", "crop_to_shape", "pad_to_multiple", "scale_min_max", "scale_residual"),
+    "scaling": (
+        "SCALINGS",
+        "crop_to_shape",
+        "pad_to_multiple",
+        "scale_matched",
+        "scale_min_max",
+        "scale_residual",
+        "scaling_named",
+    ),
     "segmenters": ("Segmenter", "detect_with_segmenters", "segmenter_from_module", "segmenter_from_onnx"),
     "training": ("EpochResult", "TrainingState", "count_epochs", "iterate_training", "learning_rate_at"),
     "weights_io": ("STARTER_PATH", "read_safetensors", "starter_recipe", "write_safetensors"),
@@ -86,6 +104,7 @@ __all__ = [
     "EpochResult",
     "Examples",
     "NetworkResult",
+    "NoiseChannels",
     "Rate",
     "Recipe",
     "Runs",
@@ -107,6 +126,8 @@ __all__ = [
     "finished_networks",
     "iterate_training",
     "learning_rate_at",
+    "measure_direction",
+    "noise_channels",
     "open_runs",
     "pad_to_multiple",
     "rate_of_crossed_trials",
@@ -117,8 +138,11 @@ __all__ = [
     "recipe_for_fine_tuning",
     "recipe_for_module",
     "recipe_of_start",
+    "say_who_is_blind",
+    "scale_matched",
     "scale_min_max",
     "scale_residual",
+    "scaling_named",
     "segmenter_from_module",
     "segmenter_from_onnx",
     "split_for_training",

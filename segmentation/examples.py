@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .recipe import PRODUCT, Recipe
-from .scaling import SCALINGS
+from .scaling import scaling_named
 
 if TYPE_CHECKING:
     from ..acquisition.dataset_io import Dataset
@@ -131,4 +131,4 @@ def _example(
 ) -> Example:
     planes = [product_mask, foreign_object_mask] if PRODUCT in recipe.classes else [foreign_object_mask]
     masks = np.stack([np.asarray(plane) != 0 for plane in planes]).astype(np.uint8)
-    return SCALINGS[recipe.scaling](image), masks
+    return scaling_named(recipe.scaling)(image), masks

@@ -115,7 +115,7 @@ def probabilities_from_scaled(
 
     Args:
         network: from `build_network`; it is put into evaluation mode.
-        scaled: (image, 2, row, column) -log(I/I0), low kV first, each scaled by `SCALINGS[recipe.scaling]`.
+        scaled: (image, 2, row, column) -log(I/I0), low kV first, each scaled by `scaling_named(recipe.scaling)`.
         recipe: the recipe that the network was trained with (scaling, classes).
         device: torch device on which the network is.
         batch: images at a time.

@@ -9,7 +9,7 @@ from typing import Any
 from ..errors import InputError
 from .augmentation import AUGMENTATIONS
 from .losses import LOSSES
-from .scaling import SCALINGS
+from .scaling import MATCHED, scaling_named
 
 FOREIGN_OBJECT = "foreign_object"
 PRODUCT = "product"
@@ -19,7 +19,6 @@ OWN_MODULE = "own module"  # in the place of an architecture: a torch module tha
 _DILATED = ("DeepLabV3", "DeepLabV3Plus")  # the encoder stops at a sixteenth (DeepLabV3: an eighth) of the resolution
 
 _CHOICES = {
-    "scaling": tuple(SCALINGS),
     "augmentation": tuple(AUGMENTATIONS),
     "loss": tuple(LOSSES),
     "optimizer": ("adam", "adamw"),
@@ -32,7 +31,8 @@ _CHOICES = {
 class Recipe:
     """What decides a training run, apart from the data, the seed and the weights it starts from.
 
-    Fields: name; scaling, augmentation, loss (keys of their tables); classes (output channels, the foreign object
+    Fields: name; scaling (`min_max`, `residual`, `matched:DEGREES`, or `matched`, whose direction `train_networks` measures);
+    augmentation, loss (keys of their tables); classes (output channels, the foreign object
     last); optimizer; learning_rate (peak of a one-cycle schedule); weight_decay; schedule; steps or epochs (exactly
     one; an epoch is one pass over the training images, steps are rounded up to whole epochs); batch (images a step, 2
     or more); crop_px (side of the square cut round the foreign object, None = whole images); batch_norm_momentum (None
@@ -67,6 +67,8 @@ class Recipe:
                 raise InputError(
                     field, received=repr(getattr(self, field)), expected="one of " + ", ".join(map(str, choices))
                 )
+        if self.scaling != MATCHED:
+            scaling_named(self.scaling)
         if self.classes not in ((FOREIGN_OBJECT,), (PRODUCT, FOREIGN_OBJECT)):
             raise InputError("classes", received=self.classes, expected="(product and) foreign_object")
         if not (math.isfinite(self.learning_rate) and 0 < self.learning_rate <= 1):
@@ -108,7 +110,7 @@ RECIPES: MappingProxyType[str, Recipe] = MappingProxyType(
     {
         "raytwin": Recipe(
             name="raytwin",
-            scaling="residual",
+            scaling=MATCHED,
             augmentation="exact",
             loss="cross_entropy_and_dice",
             classes=(FOREIGN_OBJECT,),

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from ..errors import FileFormatError, InputError
 from ..files import only_one, sha256_of_file
 from ._torch import load_torch
+from .channels import measure_direction
 from .detection import MARK_THRESHOLD, Detection, detect_on_row
 from .examples import examples_from_dataset
 from .network import probabilities_from_scaled
@@ -32,6 +34,7 @@ from .runs_io import (
     write_finished,
     write_state,
 )
+from .scaling import MATCHED, matched_along, starts_alike
 from .training import EpochResult, TrainingState, iterate_training, load_weights
 
 if TYPE_CHECKING:
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
 
 _HELD_BACK_SHARE = 0.2
 _DETECTION_BATCH = 8
+_DIRECTION_IMAGES = 64
 _SHARE_OF_KEEPING = 0.05  # of a training's time that goes into keeping states to go on from
 
 # network number, epochs done, epochs wanted, the last epoch (None: nothing new, only where it stands)
@@ -136,6 +140,7 @@ def train_networks(
     train, validation, note = split_for_training(dataset, seed=seed)
     if note:
         say(note)
+    recipe = with_direction(recipe, dataset, train, fresh=fresh)
     started_from = starting_weights_files(start_from, range(networks)) if start_from is not None else {}
     starts = {number: _starting_weights(path, recipe) for number, path in started_from.items()}
     hashes = {number: sha256_of_file(path) for number, path in started_from.items()}
@@ -202,6 +207,18 @@ def train_networks(
             }
             results.append(write_finished(runs, number, state, notes=notes))
     return results
+
+
+def say_who_is_blind(results: Sequence[NetworkResult]) -> str:
+    """One line on networks that detect no foreign object of their validation images; empty where there are none."""
+    blind = [str(result.network) for result in results if result.best.validation_hit_rate == 0.0]
+    if not blind:
+        return ""
+    who = "network " + blind[0] if len(blind) == 1 else f"networks {', '.join(blind)}"
+    return (
+        f"{who} detected none of the foreign objects in the validation images and learnt nothing of use: give more steps, a higher"
+        " learning rate, larger objects or less noise, and see with `raytwin observe` which objects can be seen at all"
+    )
 
 
 def detect_with_networks(
@@ -275,6 +292,32 @@ def detect_with_networks(
                 progress(len(pairs))
 
 
+def with_direction(
+    recipe: Recipe,
+    dataset: "Dataset",
+    numbers: NDArray[np.intp],
+    *,
+    fresh: Callable[[int, int], NDArray[Any]] | None = None,
+) -> Recipe:
+    """The recipe with the direction of scaling `matched` measured on training images; as it is where it has one, or needs none.
+
+    Args:
+        recipe: how networks are trained.
+        dataset: open dataset file.
+        numbers: of its training images; 64 of them with a foreign object tell the direction to a few degrees.
+        fresh: as for `train_networks`; the images are then those of epoch 0.
+    """
+    if recipe.scaling != MATCHED:
+        return recipe
+    objects = [int(number) for number in numbers if dataset.rows[int(number)].foreign_object]
+    some = objects[:: max(1, len(objects) // _DIRECTION_IMAGES)]
+    pairs = (
+        (dataset.images(number) if fresh is None else fresh(number, 0), dataset.foreign_object_masks(number))
+        for number in some
+    )
+    return replace(recipe, scaling=matched_along(measure_direction(pairs)))
+
+
 def _check_own(recipe: Recipe, network: Any) -> None:
     """A recipe of a module of the user's own needs that module, and no other recipe takes one."""
     if (recipe.architecture == OWN_MODULE) != (network is not None):
@@ -329,6 +372,8 @@ def _state_or_none(runs: Runs, number: int, say: Callable[[str], None]) -> Train
 def _starting_weights(path: Any, recipe: Recipe) -> dict[str, Any]:
     held, weights = read_weights(path)
     different = [name for name in OF_NETWORK if getattr(held, name) != getattr(recipe, name)]
+    if starts_alike(held.scaling, recipe.scaling):
+        different = [name for name in different if name != "scaling"]
 
     def said(of: Recipe) -> str:
         values = ((name.replace("_", " "), getattr(of, name)) for name in different)

@@ -1,9 +1,11 @@
 """What a network sees: a dual-energy pair scaled image by image, padded to what the network divides.
 
-A choice of scaling is a key of `SCALINGS`; a trained network keeps it in its recipe.
+A scaling is a word that `scaling_named` understands; a trained network keeps it in its recipe.
 """
 
+import math
 from collections.abc import Callable
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -11,16 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .channels import noise_channels, pair_of
 
-# Air is left out of the fit of `scale_residual`: there both channels are noise about zero.
-_PRODUCT_SHARE = 0.2
-# Passes of the robust fit; it settles to well under the noise on fillets with bones.
-_PASSES = 8
-# A pixel further than this from the curve, in standard deviations, has no say in it (Tukey's biweight).
-_REJECTED = 4.0
 _RESIDUAL_UNIT = 2.5
 # A pixel that was not repaired stands a hundred s out; a bone is no less visible at ten than at twenty.
 _RESIDUAL_LIMIT = 10.0
+MATCHED = "matched"  # `matched:DEGREES`; without a number the direction is still to be measured
 
 
 def scale_min_max(image: NDArray[Any]) -> NDArray[np.float32]:
@@ -36,7 +34,7 @@ def scale_min_max(image: NDArray[Any]) -> NDArray[np.float32]:
 
     Source: Andriiashen et al., per-image min-max scaling.
     """
-    pair = _pair(image)
+    pair = pair_of(image)
     low = pair.min(axis=(1, 2), keepdims=True)
     span = pair.max(axis=(1, 2), keepdims=True) - low
     return np.asarray((pair - low) / np.where(span > 0, span, 1.0), dtype=np.float32)
@@ -64,31 +62,76 @@ def scale_residual(image: NDArray[Any]) -> NDArray[np.float32]:
 
     Source of the robust fit: Beaton and Tukey 1974, Technometrics 16:147 (biweight).
     """
-    low, high = _pair(image)
-    top = max(float(np.percentile(high, 99)), 1e-6)
-    inside = high > _PRODUCT_SHARE * top
-    x, y = high[inside], low[inside]
-    curve = np.zeros(2)
-    sd = 1.0
-    if x.size >= 8:
-        # From a straight line: a parabola through all pixels would bend towards a bone in the thickest place, where
-        # nothing else holds it.
-        curve = np.array([float(np.median(y / x)), 0.0])
-        powers = np.stack([x, x * x])
-        for _ in range(_PASSES):
-            sd = _robust_sd(y - curve @ powers)
-            weights = np.clip(1.0 - ((y - curve @ powers) / (_REJECTED * sd)) ** 2, 0.0, None) ** 2
-            weighted = powers * weights
-            curve = np.linalg.lstsq(weighted @ powers.T, weighted @ y, rcond=None)[0]
-        sd = _robust_sd(y - curve @ powers)
-    beyond = np.clip((low - high * (curve[0] + curve[1] * high)) / sd, -_RESIDUAL_LIMIT, _RESIDUAL_LIMIT)
-    thickness = np.clip(2.0 * high / top - 1.0, -3.0, 3.0)
-    return np.stack([beyond / _RESIDUAL_UNIT, thickness]).astype(np.float32)
+    channels = noise_channels(image)
+    return _stacked(channels.residual, channels.thickness)
+
+
+def scale_matched(image: NDArray[Any], *, direction_deg: float) -> NDArray[np.float32]:
+    """As `scale_residual`, with channel 0 along a direction in the plane of residual and detail.
+
+    Channel 0 is cos(d) residual + sin(d) detail (`noise_channels`), which share no noise: it has unit noise in any direction,
+    and the largest contrast where d is the direction in which the foreign objects lie. At d = 0 it is the residual. Voids, which
+    change both images as a thinner product does, lie near -90 degrees, bones between 30 and 80.
+
+    Args:
+        image: (2, row, column) -log(I/I0), low kV first.
+        direction_deg: d; `measure_direction` says which.
+
+    Returns:
+        (2, row, column) float32.
+
+    Source: the best linear combination of two channels of unit, unshared noise (Fisher 1936, Ann. Eugenics 7:179).
+    """
+    channels = noise_channels(image, with_detail=True)
+    angle = math.radians(direction_deg)
+    return _stacked(
+        math.cos(angle) * channels.residual + math.sin(angle) * channels.detail,
+        channels.thickness,
+    )
 
 
 SCALINGS: MappingProxyType[str, Callable[[NDArray[Any]], NDArray[np.float32]]] = MappingProxyType(
     {"min_max": scale_min_max, "residual": scale_residual}
 )
+
+
+def matched_along(direction_deg: float) -> str:
+    """The word of `scale_matched` along a direction: `matched:-83`."""
+    return f"{MATCHED}:{direction_deg:g}"
+
+
+def scaling_named(word: str) -> Callable[[NDArray[Any]], NDArray[np.float32]]:
+    """The scaling that a word stands for: a key of `SCALINGS`, or `matched:DEGREES`.
+
+    Raises:
+        InputError: another word, or a direction that is not a number.
+    """
+    if word in SCALINGS:
+        return SCALINGS[word]
+    name, _, number = word.partition(":")
+    try:
+        direction = float(number)
+    except ValueError:
+        direction = math.nan
+    if name != MATCHED or not math.isfinite(direction):
+        raise InputError(
+            "scaling",
+            received=repr(word),
+            expected="one of " + ", ".join(SCALINGS) + f", or {MATCHED}:DEGREES",
+            remedy="`raytwin train` measures the direction; run.json of its folder has it" if word == MATCHED else "",
+        )
+    return partial(scale_matched, direction_deg=direction)
+
+
+def starts_alike(one: str, other: str) -> bool:
+    """Whether a network of one scaling may start from one of the other: objects bright in units of noise, or the same word."""
+    noise = ("residual", MATCHED)
+    return one == other or all(word.partition(":")[0] in noise for word in (one, other))
+
+
+def _stacked(contrast: NDArray[np.float64], thickness: NDArray[np.float64]) -> NDArray[np.float32]:
+    beyond = np.clip(contrast, -_RESIDUAL_LIMIT, _RESIDUAL_LIMIT) / _RESIDUAL_UNIT
+    return np.stack([beyond, np.clip(thickness, -3.0, 3.0)]).astype(np.float32)
 
 
 def pad_to_multiple(image: NDArray[Any], *, multiple: int) -> NDArray[Any]:
@@ -126,19 +169,6 @@ def crop_to_shape(image: NDArray[Any], *, shape: tuple[int, int]) -> NDArray[Any
     return image[..., cut[0], cut[1]]
 
 
-def _robust_sd(residual: NDArray[np.float64]) -> float:
-    return max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
-
-
 def _margins(length: int, padded: int) -> tuple[int, int]:
     missing = padded - length
     return missing // 2, missing - missing // 2
-
-
-def _pair(image: NDArray[Any]) -> NDArray[np.float64]:
-    pair = np.asarray(image, dtype=np.float64)
-    if pair.ndim != 3 or pair.shape[0] != 2 or 0 in pair.shape:
-        raise InputError("image", received=f"shape {pair.shape}", expected="(2, row, column), low kV first")
-    if not bool(np.isfinite(pair).all()):
-        raise InputError("image", received="a value that is not finite", expected="finite values of -log(I/I0)")
-    return pair

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, MissingDependencyError
 from ._torch import load_torch
 from .detection import MARK_THRESHOLD, Detection, detect_on_row
-from .scaling import SCALINGS, crop_to_shape, pad_to_multiple
+from .scaling import crop_to_shape, pad_to_multiple, scaling_named
 
 if TYPE_CHECKING:
     from ..acquisition.dataset_io import Dataset
@@ -53,7 +53,7 @@ def segmenter_from_module(
 
     Args:
         module: called with (image, 2, row, column) float32.
-        scaling: of the images that it was trained on, a key of `SCALINGS`; None: log images as they are.
+        scaling: of the images that it was trained on, `min_max`, `residual` or `matched:DEGREES`; None: log images as they are.
         probabilities: whether it gives these; False: logits.
         classes: `exclusive`, `independent`, or None.
         device: torch device that it is brought to.
@@ -155,15 +155,14 @@ def _scaled(
     classes: str | None,
     warn: Callable[[str], None] | None,
 ) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
-    if scaling is not None and scaling not in SCALINGS:
-        raise InputError("scaling", received=repr(scaling), expected="None or one of " + ", ".join(SCALINGS))
+    scale = None if scaling is None else scaling_named(scaling)
 
     if classes is not None and classes not in CLASSES:
         raise InputError("classes", received=repr(classes), expected="None or one of " + ", ".join(CLASSES))
     told = False
 
     def segment(images: NDArray[np.float32]) -> NDArray[np.float32]:
-        wanted = images if scaling is None else np.stack([SCALINGS[scaling](image) for image in images])
+        wanted = images if scale is None else np.stack([scale(image) for image in images])
         padded = pad_to_multiple(np.asarray(wanted, dtype=np.float32), multiple=multiple_px)
         nonlocal told
         answer = run(np.ascontiguousarray(padded))

@@ -15,6 +15,7 @@ from ..errors import FileFormatError, InputError
 from ..files import whole_file
 from ._torch import load_torch
 from .recipe import Recipe, recipe_from_mapping
+from .scaling import MATCHED
 
 STARTER_PATH = Path(__file__).parents[1] / "data" / "starter" / "starter.safetensors"
 _KEY = "raytwin_recipe"
@@ -72,10 +73,11 @@ def read_safetensors(path: str | os.PathLike[str]) -> tuple[Recipe, dict[str, An
 
 
 def starter_recipe() -> Recipe:
-    """The recipe that a network which starts from the starter is trained with: a few steps, at a small rate.
+    """The recipe that a network which starts from the starter is trained with: a few steps, at a small rate, along
+    the direction of what it is to find.
 
     Raises:
         FileFormatError: the package came without the starter.
     """
     recipe, _ = read_safetensors(STARTER_PATH)
-    return dataclasses.replace(recipe, steps=60, epochs=None, learning_rate=recipe.learning_rate / 4)
+    return dataclasses.replace(recipe, scaling=MATCHED, steps=60, epochs=None, learning_rate=recipe.learning_rate / 4)

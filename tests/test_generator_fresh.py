@@ -22,6 +22,7 @@ REFERENCE = (
     Setting(kV=40.0, power_W=40.0, exposure_ms=100.0, filters=COPPER, averaged=10),
     Setting(kV=90.0, power_W=45.0, exposure_ms=100.0, filters=COPPER, averaged=10),
 )
+RESIDUAL = replace(RECIPES["raytwin"], scaling="residual")
 LOW, HIGH = (replace(one, exposure_ms=20.0, averaged=1) for one in REFERENCE)
 
 
@@ -91,12 +92,12 @@ def test_examples_of_an_epoch_come_from_the_source_and_validation_stays_the_same
         return fresh.log_images(number, epoch=epoch)
 
     with read_dataset(references) as dataset:
-        examples = examples_from_dataset(dataset, [1, 2], recipe=RECIPES["raytwin"], fresh=images)
+        examples = examples_from_dataset(dataset, [1, 2], recipe=RESIDUAL, fresh=images)
         first, second = examples.at_epoch(1)[0][0], examples.at_epoch(2)[0][0]
         assert not np.array_equal(first, second)
         np.testing.assert_array_equal(examples[0][0], examples[0][0])
         assert calls == [(1, 1), (1, 2), (1, 0)]
-        plain = examples_from_dataset(dataset, [1, 2], recipe=RECIPES["raytwin"])
+        plain = examples_from_dataset(dataset, [1, 2], recipe=RESIDUAL)
         assert plain.at_epoch(5) is plain
 
 

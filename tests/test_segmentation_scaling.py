@@ -6,7 +6,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from raytwin.errors import InputError
-from raytwin.segmentation import crop_to_shape, pad_to_multiple, scale_min_max, scale_residual
+from raytwin.segmentation import (
+    RECIPES,
+    crop_to_shape,
+    examples_from_arrays,
+    measure_direction,
+    noise_channels,
+    pad_to_multiple,
+    scale_matched,
+    scale_min_max,
+    scale_residual,
+    scaling_named,
+)
 from raytwin.segmentation.augmentation import augment_as_published, augment_exact, crop_around_object
 
 
@@ -81,6 +92,69 @@ def test_residual_scaling_of_an_empty_field_is_finite_and_bounded():
         scaled = scale_residual(image)
         assert np.isfinite(scaled).all()
         assert np.abs(scaled[0]).max() <= 10.0 / 2.5
+
+
+def _casting(*, void=0.0, bone=0.0, seed=0):
+    """A wedge of M_high 0.4 to 0.5 with M_low = 2 M_high, and a square of 4 x 4 pixels; noise 0.02 and 0.006.
+
+    Both images lose as less product would in a void: 2 and 1 times `void`. They gain 3.2 and 1 times `bone`.
+    """
+    high, mask = np.zeros((64, 80)), np.zeros((64, 80), dtype=np.uint8)
+    high[8:56, 8:72] = np.linspace(0.4, 0.5, 64)
+    mask[30:34, 38:42] = 1
+    pair = np.stack([2.0 * high, high]) + (
+        np.multiply.outer((3.2, 1.0), bone * mask) - np.multiply.outer((2.0, 1.0), void * mask)
+    )
+    noise = np.random.default_rng(seed).standard_normal((2, 64, 80))
+    return pair + np.array([0.02, 0.006])[:, None, None] * noise, mask
+
+
+# a pixel of noise in direction p is worth hypot(p_low / 0.02, p_high / 0.006) standard deviations of both images together, of which
+# the residual shows (p_low - 2 p_high) / hypot(0.02, 0.012) and the detail the rest
+_VOID = np.hypot(2.0 / 0.02, 1.0 / 0.006)
+_BONE = np.array([1.2 / np.hypot(0.02, 0.012), (3.2 * 2.0 / 0.02**2 + 1 / 0.006**2) / _VOID])
+
+
+def test_a_void_that_the_residual_does_not_show_stands_out_of_the_detail_as_an_ideal_observer_sees_it():
+    plain, _ = _casting()
+    image, mask = _casting(void=0.02)
+    before, after = noise_channels(plain, with_detail=True), noise_channels(image, with_detail=True)
+    assert abs((after.residual - before.residual)[mask > 0].mean()) < 0.3
+    assert (before.detail - after.detail)[mask > 0].mean() == pytest.approx(0.02 * _VOID, rel=0.15)
+    shown = scale_matched(image, direction_deg=-90)[0][mask > 0].mean() * 2.5
+    assert shown == pytest.approx(0.02 * _VOID, rel=0.15)
+
+
+def test_detail_and_residual_have_unit_noise_that_they_do_not_share_and_so_has_every_direction():
+    image, _ = _casting()
+    inside = np.s_[12:52, 12:68]
+    channels = noise_channels(image, with_detail=True)
+    # 2240 pixels: robust standard deviations are known to 2.5 %, and the background takes some noise with it
+    np.testing.assert_allclose(
+        np.cov(channels.residual[inside].ravel(), channels.detail[inside].ravel()), np.eye(2), atol=0.12
+    )
+    for direction in (-83.0, 30.0):
+        assert scale_matched(image, direction_deg=direction)[0][inside].std() * 2.5 == pytest.approx(1.0, abs=0.06)
+    np.testing.assert_array_equal(scale_matched(image, direction_deg=0.0), scale_residual(image))
+
+
+def test_the_direction_is_that_of_the_objects_of_the_training_images():
+    assert measure_direction([_casting(void=0.02, seed=seed) for seed in range(4)]) == pytest.approx(-90, abs=6)
+    expected = np.degrees(np.arctan2(_BONE[1], _BONE[0]))
+    assert measure_direction([_casting(bone=0.02, seed=seed) for seed in range(4)]) == pytest.approx(expected, abs=6)
+    image, mask = _casting()
+    assert measure_direction([(image, 0 * mask)]) == 0.0
+
+
+def test_a_direction_that_was_not_measured_is_asked_for():
+    image, _ = _fillet()
+    np.testing.assert_array_equal(scaling_named("matched:-83")(image), scale_matched(image, direction_deg=-83.0))
+    for word in ("matched", "matched:", "matched:up", "minmax", "residual:3"):
+        with pytest.raises(InputError, match=r"scaling: got .*matched:DEGREES"):
+            scaling_named(word)
+    examples = examples_from_arrays(image[None], np.zeros((1, 64, 80)), recipe=RECIPES["raytwin"])
+    with pytest.raises(InputError, match="`raytwin train` measures the direction"):
+        examples[0]
 
 
 @pytest.mark.parametrize("scale", [scale_min_max, scale_residual])

@@ -21,16 +21,19 @@ from raytwin.segmentation import (
     choose_device,
     count_epochs,
     cross_entropy_and_dice,
+    detect_with_networks,
     dice_as_published,
     examples_from_arrays,
     examples_from_dataset,
     finished_networks,
     iterate_training,
     learning_rate_at,
+    measure_direction,
     open_runs,
     read_weights,
     recipe_for_fine_tuning,
     recipe_of_start,
+    say_who_is_blind,
     split_for_training,
     starter_recipe,
     train_networks,
@@ -38,9 +41,10 @@ from raytwin.segmentation import (
 from raytwin.segmentation import runs as runs_module
 from raytwin.segmentation.network import probabilities_from_scaled
 from raytwin.segmentation.runs_io import network_folder, read_state
+from raytwin.segmentation.scaling import matched_along
 
 SHAPE = (20, 36)
-QUICK = dataclasses.replace(RECIPES["raytwin"], steps=None, epochs=2, batch=2)
+QUICK = dataclasses.replace(RECIPES["raytwin"], scaling="residual", steps=None, epochs=2, batch=2)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -565,6 +569,33 @@ def test_networks_that_were_not_fine_tuned_say_what_they_are_and_no_more(trained
     assert (recipe.steps, recipe.epochs) == (other.steps, other.epochs)
 
 
+def test_training_measures_the_direction_once_keeps_it_and_starts_from_any_other(dataset_file, trained, tmp_path):
+    recipe = dataclasses.replace(QUICK, scaling="matched", epochs=1)
+    start = trained[0] / "network_000" / "weights.pt"
+    with read_dataset(dataset_file) as dataset:
+        train_networks(dataset, tmp_path / "r", recipe=recipe, start_from=start)
+        runs = open_runs(tmp_path / "r")
+        # the bones of `_pairs` are brighter than the slab in both images
+        assert runs.recipe.scaling.startswith("matched:")
+        assert 0 < float(runs.recipe.scaling.partition(":")[2]) < 90
+        again = train_networks(dataset, tmp_path / "r", recipe=recipe, networks=2, start_from=start)
+        assert [result.network for result in again] == [0, 1]
+        assert len(list(detect_with_networks(runs, dataset, [6, 7], networks=[0]))) == 2
+
+
+def test_networks_that_detect_nothing_are_named_in_one_line(trained):
+    _, results = trained
+    blind = dataclasses.replace(
+        results[0], history=(dataclasses.replace(results[0].best, validation_hit_rate=0.0),), best_epoch=1
+    )
+    seeing = dataclasses.replace(blind, network=1, history=(dataclasses.replace(blind.best, validation_hit_rate=0.5),))
+    assert say_who_is_blind([seeing]) == ""
+    assert say_who_is_blind([blind, seeing]).startswith(
+        "network 0 detected none of the foreign objects in the validation images"
+    )
+    assert "\n" not in say_who_is_blind([blind, dataclasses.replace(blind, network=3)])
+
+
 def test_starting_from_a_network_of_another_recipe_is_refused(dataset_file, trained, tmp_path):
     recipe = dataclasses.replace(QUICK, scaling="min_max")
     with read_dataset(dataset_file) as dataset:
@@ -767,7 +798,8 @@ def test_the_default_recipe_learns_to_detect_and_not_to_cry_wolf(tmp_path):
     """From random weights: bones of plain contrast are found, clean products stay clean."""
     train_images, train_masks = _pairs(96, shape=(64, 80), seed=1, boneless=3)
     test_images, test_masks = _pairs(60, shape=(64, 80), seed=2, boneless=3)
-    recipe: Recipe = dataclasses.replace(RECIPES["raytwin"], steps=240)
+    scaling = matched_along(measure_direction(zip(train_images, train_masks, strict=True)))
+    recipe: Recipe = dataclasses.replace(RECIPES["raytwin"], scaling=scaling, steps=240)
     train = examples_from_arrays(train_images, train_masks, recipe=recipe)
     test = examples_from_arrays(test_images, test_masks, recipe=recipe)
     state = list(iterate_training(train, test, recipe=recipe, seed=0))[-1]

@@ -529,6 +529,7 @@ def train(
     batch: int | None = None,
     learning_rate: float | None = None,
     crop_px: int | None = None,
+    scaling: str | None = None,
     encoder_weights: str | None = None,
     architecture: str | None = None,
     encoder: str | None = None,
@@ -554,6 +555,9 @@ def train(
             (architecture, encoder and its depth, classes, scaling), and all of the recipe where they were fine-tuned themselves.
         epochs, steps: passes over the training images, or training steps.
         batch, learning_rate, crop_px: of a step.
+        scaling: what networks see. `matched`: both images combined so that the foreign objects of the training images stand out
+            most (the recipe of the answer says along which direction); `matched:DEGREES`, a direction of your own; `residual`, what
+            the low image holds beyond the product; `min_max`. None: the recipe's.
         encoder_weights: `imagenet` (downloaded once).
         architecture, encoder: names of segmentation-models-pytorch, such as `FPN` and `resnet18`.
         network: in their place a torch module of your own, or a function without arguments that makes one: scaled log images
@@ -591,7 +595,7 @@ def train(
         1
     """
     from ..campaign.ensemble import train_together
-    from ..segmentation import choose_device, train_networks
+    from ..segmentation import choose_device, open_runs, say_who_is_blind, train_networks
 
     folder = given_path(output, expected="a folder for the networks", argument="output")
     chosen = _recipe(
@@ -602,6 +606,7 @@ def train(
             "batch": batch,
             "learning_rate": learning_rate,
             "crop_px": crop_px,
+            "scaling": scaling,
             "encoder_weights": encoder_weights,
             "architecture": architecture,
             "encoder": encoder,
@@ -647,7 +652,11 @@ def train(
             found = train_networks(images, folder, **words, fresh=fresh, fresh_noise=decided_by, network=network)
         else:
             found = train_together(images, folder, **words, workers=workers, threads=1 if threads is None else threads)
-    return TrainedNetworks(path=folder, recipe=chosen, device=where, networks=tuple(found), warnings=tuple(warnings))
+    blind = say_who_is_blind(found)
+    warnings += [blind] if blind else []
+    return TrainedNetworks(
+        path=folder, recipe=open_runs(folder).recipe, device=where, networks=tuple(found), warnings=tuple(warnings)
+    )
 
 
 def _own_recipe(recipe: "Recipe", *, architecture: str | None, encoder: str | None, workers: int) -> "Recipe":
@@ -755,7 +764,8 @@ def detect(
         split: `train`, `val`, `test` or `all`; None: `test`, and all where the file has none and is not the one trained on.
         setting: only images of this setting, as the file names it.
         threshold: probability above which a pixel is marked, 0 or more and below 1.
-        scaling: of the images that a torch module or an ONNX file was trained on, `min_max` or `residual`; None: log images.
+        scaling: of the images that a torch module or an ONNX file was trained on, `min_max`, `residual` or `matched:DEGREES`;
+            None: log images.
         probabilities: whether a torch module or an ONNX file gives these; False: logits.
         classes: of a torch module or an ONNX file with several, the last of them the foreign object: `exclusive` (a softmax) or
             `independent` (a sigmoid of the last); None: exclusive, with a line in `warnings`.

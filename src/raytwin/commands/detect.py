@@ -38,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--setting", help="only images of this setting, as the file names it")
     parser.add_argument("--threshold", type=float, default=0.5, help="probability above which a pixel is marked (0.5)")
     parser.add_argument(
-        "--scaling", help="of an ONNX file's images: min_max or residual (default: log images as they are)"
+        "--scaling",
+        help="of an ONNX file's images: min_max, residual or matched:DEGREES (default: log images as they are)",
     )
     parser.add_argument(
         "--probabilities", action="store_true", help="an ONNX file gives probabilities (default: logits)"

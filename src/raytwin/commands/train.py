@@ -48,6 +48,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--learning-rate", type=float, help="learning rate (the peak, where the recipe varies it)")
     parser.add_argument("--crop-px", type=int, help="train on squares of this side round the foreign objects")
     parser.add_argument(
+        "--scaling",
+        help="what networks see: matched (default: both images combined so that the training set's objects stand out most),"
+        " matched:DEGREES, residual or min_max",
+    )
+    parser.add_argument(
         "--start-from",
         metavar="starter|RUNS|WEIGHTS",
         help="start from trained networks: starter (comes with raytwin), a folder (its only network, or the one of"
@@ -96,6 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
             batch=arguments.batch,
             learning_rate=arguments.learning_rate,
             crop_px=arguments.crop_px,
+            scaling=arguments.scaling,
             encoder_weights=None if arguments.encoder_weights == "none" else arguments.encoder_weights,
             architecture=arguments.architecture,
             encoder=arguments.encoder,
@@ -111,6 +117,11 @@ def run(arguments: argparse.Namespace) -> int:
         )
     for line in found.warnings:
         say(f"note: {line}")
+    if found.recipe.scaling.startswith("matched:"):
+        degrees = found.recipe.scaling.partition(":")[2]
+        say(
+            f"networks see the pair along {degrees} degrees: 0 is the residual, 90 more and -90 less thickness than around"
+        )
     answer(
         found.to_dict(),
         as_json=arguments.json,

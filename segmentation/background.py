@@ -22,8 +22,9 @@ _PASSES = 4
 def smooth_part(image: NDArray[np.float64], inside: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Value of the parabola (six terms) that is fitted robustly around each pixel to the pixels inside.
 
-    The weights fall off as a Gaussian whose standard deviation is a quarter of the square root of the product's area. What
-    is much smaller stays out of the fit; what is as wide as the Gaussian or wider is followed and lost.
+    The weights fall off as a Gaussian whose standard deviation is a quarter of the square root of the product's area. A
+    square of a twentieth of that area keeps 94 % of a contrast of five standard deviations a pixel and three quarters of one
+    of a standard deviation; one of a seventh keeps less than half.
 
     Args:
         image: (row, column).

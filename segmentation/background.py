@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from .robust import biweight, robust_sd
 
-# The fit's Gaussian is a quarter of the product's side wide: of 1/8 to 1/4, planes and parabolas, a parabola of 1/4 kept most
-# of voids in a box and left least of an ellipsoid's roundness (VALIDATION tuning-21).
+# The fit's Gaussian is a quarter of the product's side wide. On generated images a parabola of that width kept as much of voids in
+# a box as a plane of half of it, and showed those in a dome, whose roundness hid them from planes.
 _WIDTH_SHARE = 0.25
 _ORDER = 2
 _LEAST_WIDTH_PX = 1.5

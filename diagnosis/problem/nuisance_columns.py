@@ -29,7 +29,6 @@ from .series_probes import SeriesProbes
 Columns = dict[str, NDArray[np.float64]]
 _Images = dict[str, NDArray[np.floating]]
 _UNKNOWN_GAIN_SD = 0.5  # relative, of the gain of a beam of unknown voltage
-_GAIN_MAP_MODES = 3  # cosines along each side
 
 
 def nuisances_of_series(
@@ -343,7 +342,7 @@ def _gain_map_noise(session: SessionModel, probes: SeriesProbes, signal: NDArray
     # relative, of one pixel's gain in sums over many pixels
     lasting = maps.gain_white + maps.gain_quantum * correlation_sum(probes.series.expected, BLOCK_PX, BLOCK_PX)
     pixel_sd = math.sqrt(lasting)
-    waves = _waves(signal.shape, _GAIN_MAP_MODES)  # the level has nuisances of its own
+    waves = _waves(signal.shape, scales.PATTERN_WAVES + 1)  # as of a changed map; the level has nuisances of its own
     amounts = [pixel_sd / math.sqrt(float(np.sum(wave**2))) * wave for wave in waves.values()]
     found = probes.of_maps(np.stack(amounts) * signal)
     return {f"gain map {i},{j}": column for (i, j), column in zip(waves, found, strict=True)}

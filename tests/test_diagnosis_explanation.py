@@ -88,7 +88,7 @@ def test_a_location_is_words_that_a_reader_knows(location, words):
         ("afterglow frames 3-4", "frames 3 to 4 after the beam"),
         ("fixed_pattern columns", "fixed pattern of columns"),
         ("temporal_correlation 1", "correlation of frames 1 apart"),
-        ("trend first frames", "first frames over the frames"),
+        ("trend first frames", "change in the first frames"),
     ],
 )
 def test_a_statistic_is_words_that_a_reader_knows(statistic, words):

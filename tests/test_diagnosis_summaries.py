@@ -485,6 +485,8 @@ def test_correlations_are_as_uncertain_as_the_neighbours_of_one_label_are_few():
     labels = np.tile(np.arange(SHAPE[1]) % 2, (SHAPE[0], 1))
     labels[:, :4] = 0
     white = SimpleNamespace(
+        mean_DN=np.zeros((1, 1)),
+        dark_DN=np.zeros((1, 1)),
         quantum_variance_DN2=np.zeros((1, 1)),
         white_variance_DN2=np.full((1, 1), 100.0),
         noise_autocovariance=np.pad([[1.0]], (0, 3)),

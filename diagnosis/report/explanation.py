@@ -16,6 +16,7 @@ _NAMED_UNTESTED = 8  # names alone are shorter
 _NAMED_FAMILIES = 4
 _RIVALS, _LEAST_LIKELY = 5, 0.05  # explanations that are named where none leads
 _UNTESTED = "It shows in series that no others tell the strength of, so that no held-out data could test it."
+_WIDE = 160  # characters of a line: titles and strengths of the longest units fit
 _MOSTLY = 0.5  # of the gap above noise, from which what takes so much explains it
 _FINDING_TITLES = {
     FindingCode.STOPS: "Numbers are cut off early",
@@ -94,7 +95,7 @@ def answer_text(diagnosis: Diagnosis) -> str:
     if diagnosis.findings:
         lines += [*(item.line for item in diagnosis.findings), "All else is of the other series."]
     if _explained(diagnosis):
-        lines.append(_causes(diagnosis).as_text())
+        lines.append(_causes(diagnosis).as_text(widest=_WIDE))
         lines += [*_where(diagnosis.where), *_fall(diagnosis)]
     else:
         lines += _not_explained(diagnosis)

@@ -28,6 +28,7 @@ _STATISTIC_WORDS = (
     (r"column_ratio", "noise of column means"),
     (r"block_ratio", "noise of block means"),
     (r"temporal_correlation (\d)", r"correlation of frames \1 apart"),
+    (r"trend first frames", "change in the first frames"),
     (r"trend (.+)", r"\1 over the frames"),
     (r"kurtosis", "tails of the noise"),
     (r"frame_factor", "level from frame to frame"),

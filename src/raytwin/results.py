@@ -31,8 +31,8 @@ class Table:
     notes: tuple[str, ...] = ()
     more: int = 0
 
-    def as_text(self, *, lines: int = LINES) -> str:
-        """At most `lines` lines; what does not fit is counted."""
+    def as_text(self, *, lines: int = LINES, widest: int = _WIDEST) -> str:
+        """At most `lines` lines of `widest` characters; rows that do not fit are counted."""
         notes = list(self.notes)
         kept_notes = notes if len(notes) <= 4 else [*notes[:3], f"... and {len(notes) - 3} more"]
         room = lines - 1 - bool(any(self.header)) - len(kept_notes)
@@ -46,7 +46,7 @@ class Table:
         body = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in table]
         if left:
             body.append(f"... and {left} more")
-        return "\n".join(_cut(line) for line in [self.title, *body, *kept_notes])
+        return "\n".join(_cut(line, widest) for line in [self.title, *body, *kept_notes])
 
     def as_html(self) -> str:
         """A table with its title and notes; every text is escaped."""
@@ -62,9 +62,9 @@ class Table:
         return f"<div><strong>{html.escape(self.title)}</strong><table>{head}<tbody>{body}</tbody></table>{below}</div>"
 
 
-def _cut(line: str) -> str:
+def _cut(line: str, widest: int) -> str:
     line = " ".join(line.splitlines()).rstrip()
-    return line if len(line) <= _WIDEST else line[: _WIDEST - 3] + "..."
+    return line if len(line) <= widest else line[: widest - 3] + "..."
 
 
 class ByValue:

@@ -1,5 +1,6 @@
 """Series that a fit does not see, and what is left of the gap there."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -95,3 +96,8 @@ def test_a_gap_that_nothing_explains_is_left_and_what_is_planted_and_named_is_go
     gap, _, shares = held_out(flats, found, np.random.default_rng(0))
     assert gap.after < 1.5
     assert shares["stripes"][0] == pytest.approx(1.0, abs=0.05)
+    assert gap.tested
+    # what shows in one series alone is told by no other
+    curve = Curve(variant=variant, responses=np.where(series_of == 0, pattern, 0.0)[None, :])
+    gap, _, _ = held_out(flats, replace(found, variants={"stripes": curve}), np.random.default_rng(0))
+    assert not gap.tested

@@ -1,4 +1,4 @@
-"""Strengths that a session shows outright: an output drift by the frames' levels, a changed gain map by later flats."""
+"""Strengths that a session shows outright: of an output drift, a changed gain map and a drifting dark."""
 
 import math
 from types import SimpleNamespace
@@ -152,3 +152,40 @@ def test_what_another_effect_changes_is_subtracted_and_its_law_may_be_off(monkey
     beside = map_rms(views, effects=("gain_map_error", "heel"))
     # 0.12 of a heel of 2.9 % rms is half of what the map has by itself
     assert beside[0] == pytest.approx(alone[0], rel=0.02) and beside[2] > 1.2 * alone[2]
+
+
+def dark(start_s, change_DN, *, exposure_ms=100.0, calibrates=False, noise_DN=3.0):
+    return SimpleNamespace(
+        session=SimpleNamespace(
+            series=SimpleNamespace(kind="dark"),
+            request=SimpleNamespace(exposure_ms=exposure_ms, start_s=start_s),
+            calibrates=calibrates,
+        ),
+        mask=np.ones(SHAPE, dtype=bool),
+        residual_DN=np.full(SHAPE, change_DN),
+        noise_DN=np.full(SHAPE, noise_DN / math.sqrt(FRAMES)),
+        summary=SimpleNamespace(frames=FRAMES),
+    )
+
+
+def test_a_drifting_dark_is_read_off_the_last_one_of_the_longest_exposure(monkeypatch):
+    """Half of the drift by noon, all of it in the evening; what lag leaves there is subtracted."""
+    monkeypatch.setattr(strengths, "_applied", lambda problem, hypothesis, effect, strength: effect)
+    moved = {"dark_drift": [0.0, 2.5, 5.0, 1.25], "image_lag": [0.0, 0.0, 2.0, 0.0]}
+    monkeypatch.setattr(
+        strengths, "map_changes", lambda problem, applied: [np.full((1, 1), one) for one in moved[applied[0]]]
+    )
+
+    def read(views, *effects):
+        hypothesis = SimpleNamespace(effects=effects, strengths=dict.fromkeys(effects, (5.0, 1.0, 9.0)))
+        return strengths._last_dark(SimpleNamespace(views=views), hypothesis, "dark_drift")
+
+    darks = [dark(0.0, 0.0, calibrates=True), dark(100.0, 7.0), dark(200.0, 12.0), dark(300.0, 9.0, exposure_ms=25.0)]
+    value, low, high = read(darks, "dark_drift")
+    assert value == pytest.approx(12.0)
+    assert high - value == value - low == pytest.approx(1.96 * 0.25, rel=0.05)
+    assert read(darks, "dark_drift", "image_lag")[0] == pytest.approx(10.0)
+    # nothing, the other way, and no later dark leave the fit its strength
+    assert read([*darks[:2], dark(200.0, 0.1), darks[3]], "dark_drift") is None
+    assert read([*darks[:2], dark(200.0, -12.0), darks[3]], "dark_drift") is None
+    assert read(darks[:1], "dark_drift") is None

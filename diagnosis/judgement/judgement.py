@@ -58,11 +58,12 @@ def judge(
     # what acts in some series alone is nothing that the line has
     lasting = [effect for effect in named if not leading.variants[effect].variant.series]
     added = tuple(applied_at_best(problem, leading, effect) for effect in lasting)
+    as_read = replace(leading, strengths={effect: strength_of(problem, leading, effect) for effect in leading.variants})
     ambiguous = verdict.word == "ambiguous"
     return Diagnosis(
         verdict=verdict.word,
         hypotheses=verdict.hypotheses,
-        causes=_causes(problem, verdict, shares | likeliest, _places_left(problem, leading)),
+        causes=_causes(problem, verdict, shares | likeliest, _places_left(problem, as_read)),
         probability_no_gap=next((item.probability for item in verdict.hypotheses if not item.effects), 0.0),
         probability_unknown=marginal.get(UNKNOWN, 0.0),
         unknown_location=next((item.location for item in verdict.hypotheses if item.effects == (UNKNOWN,)), ""),

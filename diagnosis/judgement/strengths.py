@@ -36,12 +36,13 @@ _NEAR_PX = 6  # from an object's outline: where it may really lie, and what its 
 def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> AppliedEffect:
     """The effect as a hypothesis has it, in this session, with the strength that fits all probes best.
 
-    The fit of a drifting output or a changed gain map knows how much it does by chance, not how much it did: these get the strength
-    that was read.
+    The fit of a drifting output or a changed gain map knows how much it does by chance, not how much it did, and that of a drifting
+    dark takes its whole course: these get the strength that was read.
     """
     strength = hypothesis.strengths[effect][0]
     value, low, high = strength_of(problem, hypothesis, effect)
-    if EFFECTS[effect].reading.frame_levels or EFFECTS[effect].reading.map_rms:
+    reading = EFFECTS[effect].reading
+    if reading.frame_levels or reading.map_rms or reading.last_dark:
         strength = value
     return replace(
         _applied(problem, hypothesis, effect, strength),

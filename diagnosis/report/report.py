@@ -201,7 +201,8 @@ def _key_figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
         found = [
             {"value": f"{diagnosis.probability_unknown:.2f}", "text": "probability of an effect outside the catalogue"}
         ]
-    if diagnosis.added:
+    removes = bool(diagnosis.added) and gap.tested
+    if removes:
         found.append(
             {
                 "value": f"{gap.before:.2f} → {gap.after:.2f}",
@@ -210,7 +211,7 @@ def _key_figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
         )
     else:
         found.append({"value": f"{gap.before:.2f}", "text": "gap (1: noise alone)"})
-    if diagnosis.added and gap.shrinks_by is not None:
+    if removes and gap.shrinks_by is not None:
         value, low, high = (100.0 * min(one, 1.0) for one in gap.shrinks_by)
         text = f"of the gap above noise is removed (95 %: {low:.0f} to {high:.0f} %)"
         if not gap.falls:
@@ -228,7 +229,7 @@ def _causes(diagnosis: Diagnosis) -> SortedTable:
             strength_text(cause),
             ", ".join(f"{name} {value:.3g}" for name, value in cause.parameters.items()),
             when_text(cause),
-            share_text(cause.shrinks_by),
+            share_text(cause.shrinks_by) if diagnosis.gap.tested else "",
             f"{100.0 * cause.level:.0f} %",
         )
         for cause in diagnosis.causes

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from raytwin.diagnosis.judgement import strengths
+from raytwin.generator.effects import AppliedEffect
 
 SHAPE, FRAMES, SIGNAL_DN = (24, 24), 20, 5000.0
 OUTPUT = 0.006 * np.sin(0.05 * np.arange(8 * FRAMES))
@@ -170,11 +171,18 @@ def dark(start_s, change_DN, *, exposure_ms=100.0, calibrates=False, noise_DN=3.
 
 def test_a_drifting_dark_is_read_off_the_last_one_of_the_longest_exposure(monkeypatch):
     """Half of the drift by noon, all of it in the evening; what lag leaves there is subtracted."""
-    monkeypatch.setattr(strengths, "_applied", lambda problem, hypothesis, effect, strength: effect)
     moved = {"dark_drift": [0.0, 2.5, 5.0, 1.25], "image_lag": [0.0, 0.0, 2.0, 0.0]}
-    monkeypatch.setattr(
-        strengths, "map_changes", lambda problem, applied: [np.full((1, 1), one) for one in moved[applied[0]]]
-    )
+    early = {10.0: 0.0, 0.1: 0.0}  # share of the drift by the calibrating darks, by the law's course
+
+    def applied(problem, hypothesis, effect, strength):
+        return AppliedEffect(id=effect, parameters={"strength": strength}, since="always")
+
+    def changes(problem, effects):
+        share = 1.0 - early.get(effects[0].parameters.get("warm_up"), 0.0)
+        return [np.full((1, 1), share * one) for one in moved[effects[0].id]]
+
+    monkeypatch.setattr(strengths, "_applied", applied)
+    monkeypatch.setattr(strengths, "map_changes", changes)
 
     def read(views, *effects):
         hypothesis = SimpleNamespace(effects=effects, strengths=dict.fromkeys(effects, (5.0, 1.0, 9.0)))
@@ -185,6 +193,9 @@ def test_a_drifting_dark_is_read_off_the_last_one_of_the_longest_exposure(monkey
     assert value == pytest.approx(12.0)
     assert high - value == value - low == pytest.approx(1.96 * 0.25, rel=0.05)
     assert read(darks, "dark_drift", "image_lag")[0] == pytest.approx(10.0)
+    # a course that may have been over a third before it began leaves the rest open
+    early[0.1] = 0.3
+    assert read(darks, "dark_drift")[2] - 12.0 == pytest.approx(1.96 * math.hypot(0.25, 12.0 * 0.3 / 12**0.5), rel=0.05)
     # nothing, the other way, and no later dark leave the fit its strength
     assert read([*darks[:2], dark(200.0, 0.1), darks[3]], "dark_drift") is None
     assert read([*darks[:2], dark(200.0, -12.0), darks[3]], "dark_drift") is None

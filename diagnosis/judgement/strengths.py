@@ -196,7 +196,8 @@ def _map_rms(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[flo
 def _last_dark(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:
     """The strength at which the last dark of the longest exposure has its level, and its 95 % interval.
 
-    None: there is no dark that does not calibrate, or other effects, noise and darks that repeat as they do leave nothing of it.
+    What had drifted when the calibrating darks were taken is the law's: its inner parameters may lie anywhere in their ranges. None:
+    there is no dark that does not calibrate, or other effects, noise and darks that repeat as they do leave nothing of it.
     """
     darks = [
         (view.session.request.exposure_ms, view.session.request.start_s, number)
@@ -210,19 +211,25 @@ def _last_dark(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[f
     others = [one for one in hypothesis.effects if one != effect]
     best = hypothesis.strengths[effect][0]
 
-    def moved_DN(effects: Sequence[str]) -> float:
-        if not effects:
-            return 0.0
-        applied = [_applied(problem, hypothesis, one, hypothesis.strengths[one][0]) for one in effects]
-        return mean_over(map_changes(problem, applied)[number], view.mask)
+    def moved_DN(applied: Sequence[AppliedEffect]) -> float:
+        return mean_over(map_changes(problem, applied)[number], view.mask) if applied else 0.0
 
-    of_others, of_one = moved_DN(others), moved_DN([effect]) / best
+    of_others = moved_DN([_applied(problem, hypothesis, one, hypothesis.strengths[one][0]) for one in others])
+    own = _applied(problem, hypothesis, effect, best)
+    of_one = moved_DN([own]) / best
     if of_one == 0.0:
         return None
     value = (mean_over(view.residual_DN, view.mask) - of_others) / of_one
     frames = math.sqrt(_noise_of_a_frame(view) / view.summary.frames)
     off = max((EFFECTS[one].reading.law_sd for one in others), default=0.0) * abs(of_others)
-    reach = Z95 * math.hypot(scales.DARK_SD_DN, frames, off) / abs(of_one)
+    ends = [
+        moved_DN([replace(own, parameters={**own.parameters, inner.name: end})]) / best / of_one
+        for inner in EFFECTS[effect].parameters
+        if inner.fitted and inner.name != "strength"
+        for end in (inner.low, inner.high)
+    ]
+    course = (max(ends) - min(ends)) / math.sqrt(12.0) if ends else 0.0  # even between them
+    reach = Z95 * math.hypot(math.hypot(scales.DARK_SD_DN, frames, off) / of_one, course * value)
     return (value, value - reach, value + reach) if value > reach else None
 
 

@@ -96,7 +96,6 @@ DARK_DRIFT = Effect(
     absorbed="nothing",
     grid=Grid(shares=(0.8,)),
     variation=Variation(random="sides"),
-    # a mean dark says its level outright; its course between darks is the law's
     reading=Reading(sd=0.0, last_dark=True),
     images=InImages(left_out="it depends on the time in a session"),
 )

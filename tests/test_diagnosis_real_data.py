@@ -57,9 +57,6 @@ def test_k11_flats_after_the_scan_are_brighter_and_the_tomogram_itself_cannot_be
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True, reason="one level that rose is named a gain that remembers exposure, 0.70: LIMITS level-2"
-)
 @pytest.mark.skipif(not K11.is_dir(), reason="the K11 tomography scan is not here (shared/realdata/k11)")
 def test_k11_one_level_that_rose_names_no_effect_with_confidence(tmp_path, capsys):
     _, answer = diagnosed(K11 / "k11-18014.nxs", "nxtomo", tmp_path, capsys)

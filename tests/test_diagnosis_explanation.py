@@ -109,10 +109,10 @@ def test_the_printed_answer_is_a_headline_a_table_and_a_sentence_a_line():
         diagnosis("explained", causes=(found,), named=("object_scatter",), notes=("three series moved",))
     ).splitlines()
     assert lines[0] == "Radiation scattered by the object, 12.3 % (9.9 to 14.8)"
-    assert lines[1] == "It is explained by:"
-    assert lines[2].split("  ")[0] == "effect"
-    assert lines[3].endswith("0.94         12.3 % (9.9 to 14.8)  always there  80 %")
-    assert lines[4] == "The gap shows in brightness, pattern across the field and noise texture."
+    assert lines[1] == "The gap shows in brightness, pattern across the field and noise texture."
+    assert lines[3] == "It is explained by:"
+    assert lines[4].split("  ")[0] == "effect"
+    assert lines[5].endswith("0.94         12.3 % (9.9 to 14.8)  always there  80 %")
     assert lines[-2].endswith("by 82 % (75 to 90) of what is above noise.")
     assert lines[-1] == "Three series moved."
 

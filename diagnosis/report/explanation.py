@@ -90,13 +90,13 @@ def strained_text(diagnosis: Diagnosis) -> str:
 
 
 def answer_text(diagnosis: Diagnosis) -> str:
-    """What `raytwin diagnose` prints: the headline, the causes as a table, and then a sentence a line."""
+    """What `raytwin diagnose` prints: the headline, where, the causes as a table, and what else is to be said, a sentence a line."""
     lines = [headline(diagnosis)]
     if diagnosis.findings:
         lines += [*(item.line for item in diagnosis.findings), "All else is of the other series."]
     if _explained(diagnosis):
-        lines.append(_causes(diagnosis).as_text(widest=_WIDE))
-        lines += [*_where(diagnosis.where), *_fall(diagnosis)]
+        lines += _where(diagnosis.where)
+        lines += [_causes(diagnosis).as_text(widest=_WIDE), *_fall(diagnosis)]
     else:
         lines += _not_explained(diagnosis)
     if diagnosis.not_tested or diagnosis.warnings:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
 from ..generator.frames.present_line import present_line
+from ..generator.line.belt_path import belt_path_px
 from ..generator.line.binning import refuse_binning
 from ..generator.line.line_limits import broken_limits
 from ..generator.line.spectral_signal import OpenBeam, SpectralModel
@@ -386,9 +387,13 @@ class LineImages:
         return bins.on_columns(along) if on_columns else bins.on_rows(along)
 
     def motion_px(self, setting: Setting) -> float:
-        """Path (px) of the object's image in one exposure: v M t / pixel, of a TDI detector in one stage's share of it."""
+        """Path (px) of the object's image in one exposure."""
         if setting.belt_speed_mm_s is None:
             return 0.0
-        instrument = self.twin.instrument
-        path = setting.belt_speed_mm_s * setting.exposure_ms / 1000.0 / self.object_pixel_mm
-        return path / (instrument.tdi_stages or 1) if instrument.detector == "tdi" else path
+        return belt_path_px(
+            self.twin.instrument,
+            speed_mm_s=setting.belt_speed_mm_s,
+            exposure_ms=setting.exposure_ms,
+            magnification=self.twin.instrument.magnification or 1.0,
+            pixel_mm=self.pixel_mm,
+        )

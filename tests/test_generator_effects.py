@@ -647,6 +647,28 @@ def test_the_focal_spot_that_the_instrument_states_blurs_objects_and_a_larger_on
         assert heights[True, size_mm] / heights[False, 0.0] == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.parametrize("exposure_ms", [20, 50])
+def test_the_belt_that_a_series_states_blurs_what_lies_on_it_along_its_axis(series_line, exposure_ms):
+    """A wave loses sinc(path f); of a TDI detector the path is that of one stage; the open beam knows no belt."""
+    order, place = 12, (np.indices(SHAPE)[0] + 0.5) / 40
+    wave = np.cos(np.pi * order * place)
+    setting = MEASURED.replace("exposure_ms=20", f"exposure_ms={exposure_ms}")
+    still = request("object", setting, source_object_mm=700.0)
+    moving = replace(still, belt_speed_mm_s=12.0)
+    tdi = replace(series_line, instrument=replace(series_line.instrument, detector="tdi", tdi_stages=4))
+    np.testing.assert_array_equal(*(expect(series_line, one).signal_DN for one in (still, moving)))
+
+    def height(line, asked):
+        open_DN = expect(line, asked).signal_DN
+        return float(np.mean(wave * expect(line, replace(asked, thickness_mm=ripple(0, order))).signal_DN / open_DN))
+
+    path_px = 12.0 * 1059.0 / 700.0 * exposure_ms / 1000.0 / 0.15
+    before = height(series_line, still)
+    assert height(series_line, moving) / before == pytest.approx(np.sinc(path_px * order / 80), rel=1e-3)
+    assert height(series_line, replace(moving, belt_axis="column")) == pytest.approx(before, rel=1e-6)
+    assert height(tdi, moving) / height(tdi, still) == pytest.approx(np.sinc(path_px / 4 * order / 80), rel=1e-3)
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 def test_motion_blurs_along_the_belt_in_proportion_to_the_exposure(series_line, axis):
     for exposure_ms in (20, 50):

@@ -7,19 +7,21 @@ from ...acquisition.setting import Setting
 from ...errors import InputError
 from ..effects import AppliedEffect
 from ..effects.motion_blur import MOTION_BLUR, STATED_MS
+from ..line.belt_path import belt_path_px
 from ..line.twin import Twin
 
 
 def motion_strength_px(instrument: Instrument, setting: Setting) -> float | None:
-    """Path (px) of the object's image in 50 ms on the belt, as the effect `motion_blur` states it; None where there is none.
-
-    v M 50 ms / pixel; of a TDI detector, whose charge moves along with the object, in one stage's share of that time.
-    """
+    """Path (px) of the object's image in 50 ms on the belt, as the effect `motion_blur` states it; None where there is none."""
     if setting.belt_speed_mm_s is None or instrument.pixel_mm is None:
         return None
-    magnification = instrument.magnification or 1.0
-    path = setting.belt_speed_mm_s * magnification * STATED_MS / 1000.0 / instrument.pixel_mm
-    return path / (instrument.tdi_stages or 1) if instrument.detector == "tdi" else path
+    return belt_path_px(
+        instrument,
+        speed_mm_s=setting.belt_speed_mm_s,
+        exposure_ms=STATED_MS,
+        magnification=instrument.magnification or 1.0,
+        pixel_mm=instrument.pixel_mm,
+    )
 
 
 def check_one_belt(pair: tuple[Setting, Setting]) -> None:

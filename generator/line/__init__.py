@@ -9,6 +9,7 @@ Files:
     line_state        the stages from beam to ADC, and what the state of the line holds at each
     applied_effect    an effect as one line has it: id, parameters, since when
     series_request    what one series states of itself
+    belt_path         how far a belt moves in one exposure
     line_limits       tube load, readout, belt and count rate that a line can have
     binning           signal and noise of b x b pixels
     rounding          variance that coarse steps of the ADC add

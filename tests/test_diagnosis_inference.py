@@ -1013,7 +1013,10 @@ def test_what_a_law_leaves_is_its_own_beside_a_nuisance_of_series_that_it_does_n
     others = [varied(one, high=5000.0) for one in independent(*[(10, 1.0)] * 8)]
     law = 1.0 + 0.2 * rng.standard_normal(PROBES)
     residual = 600.0 * strong.response(1.0) * law + 60.0 * weak.response(1.0) + noise(rng, level)
-    assert weigh(residual, level, [strong, weak, *others])[0].effects == ("effect0",)
+    found = weigh(residual, level, [strong, weak, *others])[0]
+    assert found.effects == ("effect0",)
+    # beyond doubt something is left, in the shape of the other
+    assert found.misfit in {NAMES[number] for number in set(GROUPS[acting].tolist())}
     # where the first does not act it leaves nothing
     elsewhere = replace(weak, responses=weak.responses - 1.0 / 15.0)
     residual = 600.0 * strong.response(1.0) * law + 60.0 * elsewhere.response(1.0) + noise(rng, level)

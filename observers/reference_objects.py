@@ -14,11 +14,16 @@ Pair = tuple[Setting, Setting]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sight:
-    """What is looked at. Fields: objects; image (a key of `line_images.IMAGES`); texture of the product (None: there is none)."""
+    """What is looked at.
+
+    Fields: objects; image (a key of `line_images.IMAGES`); texture of the product (None: there is none); warnings: of references
+    whose texture cannot be read.
+    """
 
     objects: ForeignObjects
     image: str
     texture: ProductTexture | None
+    warnings: tuple[str, ...] = ()
 
 
 def sight_of_references(
@@ -54,14 +59,21 @@ def sight_of_references(
         raise InputError(dataset.path, received="references without their settings", expected="LOW;HIGH in each row")
     if image is None and detector != "ideal":
         image = "residual"
-    texture = None
+    texture: ProductTexture | None = None
+    warnings: tuple[str, ...] = ()
     if image is None or image in TEXTURED:
         try:
             texture = texture_of_references(dataset, line, pair=pair, material=product_material)
-        except InputError:
+        except InputError as error:
             if image is not None:
                 raise
+            warnings = (f"the product's texture cannot be read, so the residual image is looked at: {error}",)
     objects = line.objects_from_references(
         found, pair=pair, product_material=product_material, foreign_material=foreign_material, size=size
     )
-    return Sight(objects=objects, image=image or ("residual" if texture is None else "both"), texture=texture)
+    return Sight(
+        objects=objects,
+        image=image or ("residual" if texture is None else "both"),
+        texture=texture,
+        warnings=warnings,
+    )

@@ -300,3 +300,10 @@ def test_a_description_cannot_be_screened(line):
     (line / "described.toml").write_text(text)
     with pytest.raises(InputError, match=r"\[screening\].*expected reference images"):
         read_campaign(line / "described.toml")
+
+
+def test_references_whose_texture_cannot_be_read_are_named(line):
+    pair = tuple(setting_from_text(f"kv={kV},power_w=40,exposure_ms=50,filter=Cu:0.05") for kV in (40, 90))
+    answer = rt.observe(read_twin(line / "twin.h5"), pair, references=line / "references.h5")
+    assert answer.observer["image"] == "residual"
+    assert any("texture cannot be read, so the residual image" in line for line in answer.warnings)

@@ -247,7 +247,7 @@ def observe(
     found = observe_settings(line, pairs, objects, observer=observer, texture=texture)
     expected = None if efficiency is None else predicted_sizes(line, pairs, objects, efficiency, texture=texture)
     against = line.reasons_against(pairs, objects, image=observer.image)
-    warnings = [*line.warnings, *(reason for reason in against if reason), *_outside(line, pairs)]
+    warnings = [*line.warnings, *sight.warnings, *(reason for reason in against if reason), *_outside(line, pairs)]
     largest = float(objects.size.max())
     if efficiency is None:
         warnings.append(

@@ -53,7 +53,8 @@ class Part:
     """A session whose flats calibrate where their beam is among some; of beams that are not, one series of each is predicted."""
 
     def __init__(self, acquisition: Any, beams: tuple[tuple[float, str], ...]) -> None:
-        self.path, self.instrument, self.scenes = acquisition.path, acquisition.instrument, acquisition.scenes
+        self.path, self.paths = acquisition.path, acquisition.paths
+        self.instrument, self.scenes = acquisition.instrument, acquisition.scenes
         kept: list[Any] = []
         longest: dict[tuple[float, str], Any] = {}
         for item in acquisition.series:

@@ -9,6 +9,7 @@ import pytest
 
 from raytwin.diagnosis.inference.curve_fits import (
     CurveFit,
+    first_looks,
     fit_curve,
     fit_effects,
     interval_of,
@@ -411,7 +412,7 @@ def test_an_interval_covers_the_variants_that_are_as_likely():
 
     def fit(scale):
         curve = one_node("a", scale * response, name=str(scale))
-        return fit_curve(seen(residual), curve, exact=True)
+        return first_looks(seen(residual), [curve])[0]
 
     # the same picture at half the size means twice the strength
     one, both = interval_of([fit(1.0)]), interval_of([fit(1.0), fit(0.5)])
@@ -424,11 +425,11 @@ def test_a_variant_counts_in_an_interval_as_much_as_its_evidence_says():
     rng = np.random.default_rng(4)
     response = rng.standard_normal(PROBES) * 0.3
     observed = seen(4.0 * response + rng.standard_normal(PROBES))
-    whole = fit_curve(observed, one_node("a", response), exact=True)
+    whole = first_looks(observed, [one_node("a", response)])[0]
     one = interval_of([whole])
     # the same picture at half the size, twice the strength: e^-8 as probable beforehand, or of laws that are off so seldom
-    unlikely = fit_curve(observed, one_node("a", 0.5 * response, log_prior=-8.0), exact=True)
-    seldom = fit_curve(observed, one_node("a", 0.5 * response), exact=True)
+    unlikely = first_looks(observed, [one_node("a", 0.5 * response, log_prior=-8.0)])[0]
+    seldom = first_looks(observed, [one_node("a", 0.5 * response)])[0]
     for other in (unlikely, replace(seldom, log_evidence=seldom.log_evidence - 8.0)):
         assert interval_of([whole, other]) == pytest.approx(one, rel=0.01)
     # half as probable as the other one: a third of the posterior
@@ -445,7 +446,7 @@ def test_a_peak_far_sharper_than_the_nodes_lie_apart_is_found(sharpness):
     response = sharpness * rng.standard_normal(PROBES)
     residual = 4.0 * response + rng.standard_normal(PROBES)
     curve = one_node("a", response, low=0.05)
-    fit = fit_curve(seen(residual), curve, exact=True)
+    fit = first_looks(seen(residual), [curve])[0]
     exact = float(response @ residual / (response @ response))
     sd = 1.0 / float(np.linalg.norm(response))
     assert abs(fit.best - exact) < 0.26 * sd
@@ -702,21 +703,21 @@ def test_effects_weaker_and_stronger_than_is_plausible_are_found_and_told():
     bends = in_nodes("b", np.outer([20.0, 45.0], response), [20.0, 50.0], low=1.0, high=50.0)
     for curve, strength in ((grows, 0.1), (grows, 110.0), (bends, 0.1), (bends, 70.0)):
         residual = curve.response(strength) + rng.standard_normal(PROBES)
-        fit = fit_curve(seen(residual), curve, exact=True)
+        fit = first_looks(seen(residual), [curve])[0]
         assert fit.best == pytest.approx(strength, rel=0.25)
         _, low, high = interval_of([fit])
         assert low < strength < high
         # 0.1 lies ten standard deviations from none; a strength that is plausible costs less
-        plausible = fit_curve(seen(residual), varied(curve, low=strength / 7.0, high=7.0 * strength), exact=True)
+        plausible = first_looks(seen(residual), [varied(curve, low=strength / 7.0, high=7.0 * strength)])[0]
         assert 20.0 < fit.log_evidence < plausible.log_evidence < fit.log_evidence + 6.0
     # noise alone is no evidence of a strength that cannot be seen
-    fit = fit_curve(seen(rng.standard_normal(PROBES)), grows, exact=True)
+    fit = first_looks(seen(rng.standard_normal(PROBES)), [grows])[0]
     assert fit.log_evidence < -3.0
 
 
 def test_the_prior_beyond_the_plausible_range_takes_a_hundredth_of_the_probability():
     curve = one_node("a", np.full(PROBES, 1e-9), low=1.0, high=50.0)
-    fit = fit_curve(seen(np.zeros(PROBES)), curve, exact=True)
+    fit = first_looks(seen(np.zeros(PROBES)), [curve])[0]
     assert fit.log_evidence == pytest.approx(0.0, abs=1e-6)
     assert fit.strengths[0] == pytest.approx(1.0 / 30.0)
     assert fit.strengths[-1] == pytest.approx(125.0)
@@ -770,7 +771,7 @@ def test_an_interval_holds_what_inner_parameters_leave_open():
         law = {"parameters": {"shape": known}, "fitted": (shape,), "refined_from": "grid"}
         curve = one_node("veiling_glare", a + known * b, low=0.1, high=20.0, **law)
         observed = seen(residual)
-        fit = fit_curve(observed, curve, exact=True)
+        fit = first_looks(observed, [curve])[0]
         found = Hypothesis(
             effects=("veiling_glare",),
             probability=1.0,
@@ -887,7 +888,7 @@ def test_the_evidence_of_an_effect_at_its_point_is_the_integral_over_the_strengt
     (curve,) = (varied(one, low=1.0) for one in independent((200, 600.0)))
     residual = curve.response(strength) + np.random.default_rng(3).standard_normal(PROBES)
     observed = seen(residual)
-    point = fit_curve(observed, curve, exact=True).point
+    point = first_looks(observed, [curve])[0].point
     evidence = observed.in_presence_of(point).log_likelihood - observed.log_likelihood + log_prior(observed, point)
     # by hand: a Gaussian in the strength; 0.99 of the prior is plausible, the last case wants less than is tried
     low, high = curve.reach

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from ..model.curves import Curve
-from .discrepancy import LEAST_MOVED, LEVELS, Levels
+from .discrepancy import LEAST_MOVED, LEVELS, Levels, only
 from .observed import Observed, Point
 
 _ROUNDS, _SETTLED = 4, 0.05  # in which a level's best strength is found, and change of its logarithm that ends them
@@ -61,7 +61,7 @@ def _over_levels(by_level: NDArray[np.float64], frequencies: Sequence[float]) ->
     return float(logsumexp(by_level, b=np.asarray(frequencies[: len(by_level)])))
 
 
-def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exact: bool = False) -> CurveFit:
+def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS) -> CurveFit:
     """Evidence of one curve over none, its strength integrated over a log-uniform prior, see `log_integral`.
 
     What an effect does by chance grows with its strength; at each level the covariance is that of the law at its best strength, found
@@ -71,36 +71,57 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
         observed: what is weighed.
         curve: in the units of the first probes.
         levels: of discrepancy.
-        exact: the law is taken as exact: a first look, at a fraction of the cost.
     """
-    own, coarse, scaled = curve.variant, curve.log_strengths(), observed.scaled(curve)
-    sharp = _Terms(observed, scaled)
-    strengths, value = sharp.closed_in(coarse)
-    first = log_integral(strengths, value, own.low, own.high)
-    found = [(first, strengths, value)]
-    if not exact:
-        start = float(strengths[int(np.argmax(value))])
-        found = [_at_level(observed, scaled, start, level, sharp) or found[0] for level in levels.levels]
-    by_level = np.array([item[0] for item in found])
-    frequencies = (1.0,) if exact else levels.of_kind
+    scaled = observed.scaled(curve)
+    (sharp,) = _Terms.of_each(observed, [scaled])
+    exact = sharp.closed_in()
+    found = [_off_by(observed, scaled, exact, level, sharp) or exact for level in levels.levels]
+    return _fit_of(curve, found, levels)
+
+
+def first_looks(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
+    """The same of several curves with their laws taken as exact, at a fraction of the cost."""
+    terms = _Terms.of_each(observed, [observed.scaled(curve) for curve in curves])
+    return [_fit_of(curve, [own.closed_in()], only(0.0)) for curve, own in zip(curves, terms, strict=True)]
+
+
+def _fit_of(curve: Curve, found: Sequence["_Likelihood"], levels: Levels) -> CurveFit:
+    """A fit from the likelihood at each level."""
+    own = curve.variant
+    by_level = np.array([item.log_evidence(own.low, own.high) for item in found])
     with np.errstate(divide="ignore"):
-        likeliest = int(np.argmax(by_level + np.log(np.asarray(frequencies))))
+        likeliest = int(np.argmax(by_level + np.log(np.asarray(levels.of_kind))))
     return CurveFit(
         curve=curve,
         by_level=by_level + own.log_prior,
-        at_any_strength=np.array([log_integral(at, value, *curve.reach) for _, at, value in found]) + own.log_prior,
-        log_evidence=_over_levels(by_level, frequencies) + own.log_prior,
-        level=0.0 if exact else levels.levels[likeliest],
-        strengths=found[likeliest][1],
-        log_likelihood=found[likeliest][2],
+        at_any_strength=np.array([item.log_evidence(*curve.reach) for item in found]) + own.log_prior,
+        log_evidence=_over_levels(by_level, levels.of_kind) + own.log_prior,
+        level=levels.levels[likeliest],
+        strengths=found[likeliest].strengths,
+        log_likelihood=found[likeliest].values,
     )
 
 
-def fit_effect(observed: Observed, curve: Curve, *, exact: bool = False) -> CurveFit:
+def fit_effect(observed: Observed, curve: Curve) -> CurveFit:
     """A curve fitted to what is weighed, where the twin has all its effects but this one; evidence over all that it has."""
     alone = observed.conditioned(curve.effect)
-    fit = fit_curve(alone, curve, exact=exact)
-    more = observed.log_evidence_without(curve.effect)
+    return _over_given(observed, fit_curve(alone, curve))
+
+
+def first_looks_at_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
+    """The same of several curves with their laws taken as exact."""
+    given = [curve for curve in curves if observed.has(curve.effect)]
+    others = [curve for curve in curves if not observed.has(curve.effect)]
+    found = dict(zip(map(id, others), first_looks(observed.conditioned(), others), strict=True))
+    for curve in given:
+        (fit,) = first_looks(observed.conditioned(curve.effect), [curve])
+        found[id(curve)] = _over_given(observed, fit)
+    return [found[id(curve)] for curve in curves]
+
+
+def _over_given(observed: Observed, fit: CurveFit) -> CurveFit:
+    """A fit where the twin has all its effects but this one, its evidence over all that it has."""
+    more = observed.log_evidence_without(fit.curve.effect)
     return replace(
         fit,
         by_level=fit.by_level + more,
@@ -111,7 +132,7 @@ def fit_effect(observed: Observed, curve: Curve, *, exact: bool = False) -> Curv
 
 def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
     """Every curve fitted: with all levels of discrepancy those variants of an effect that are likeliest, or close to it, if exact."""
-    found = [fit_effect(observed, curve, exact=True) for curve in curves]
+    found = first_looks_at_effects(observed, curves)
     ranked: dict[str, list[int]] = {}
     for number in sorted(range(len(curves)), key=lambda number: -found[number].log_evidence):
         ranked.setdefault(curves[number].effect, []).append(number)
@@ -127,6 +148,23 @@ def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
     return found
 
 
+@dataclass(frozen=True, slots=True)
+class _Likelihood:
+    """Log likelihood over none (node,) of a curve at strengths (node,)."""
+
+    strengths: NDArray[np.float64]
+    values: NDArray[np.float64]
+
+    def log_evidence(self, low: float, high: float) -> float:
+        """Under a prior of a strength that is plausible from low to high."""
+        return log_integral(self.strengths, self.values, low, high)
+
+    @property
+    def best(self) -> float:
+        """Strength where it is highest."""
+        return float(self.strengths[int(np.argmax(self.values))])
+
+
 class _Terms:
     """Log likelihood over none of a curve at any strength: r ~ N(m(s), C + s^2 S S^T), S what it does by chance, C all else.
 
@@ -134,15 +172,28 @@ class _Terms:
     1/2 sum c_i^2 s^2 / (1 + s^2 d_i) - 1/2 sum log(1 + s^2 d_i).
     """
 
-    def __init__(self, observed: Observed, curve: Curve) -> None:
+    @classmethod
+    def of_each(cls, observed: Observed, curves: Sequence[Curve]) -> "list[_Terms]":
+        """Those of several curves, in the units of what is weighed."""
+        parts = [np.concatenate([curve.responses, _chance_of(curve)]) for curve in curves]
+        vectors = np.concatenate([observed.residual[None, :], *parts])
+        taken_up = observed.nuisances.project(vectors)
+        ends = np.cumsum([1, *map(len, parts)])
+        found = []
+        for curve, start, end in zip(curves, ends[:-1], ends[1:], strict=True):
+            own, left = vectors[start:end], taken_up[start:end]
+            of_residual = own @ vectors[0] - left @ taken_up[0]
+            found.append(cls(curve, own @ own.T - left @ left.T, of_residual))
+        return found
+
+    def __init__(self, curve: Curve, inner: NDArray[np.float64], of_residual: NDArray[np.float64]) -> None:
+        """Of the curve's responses, and what it does by chance after them: a C^-1 b, and a C^-1 r."""
         self._curve = curve
-        nodes, chance = len(curve.responses), _chance_of(curve)
-        moved = np.concatenate([curve.responses, observed.residual[None, :], chance])
-        inner = observed.nuisances.inner(moved, moved)
-        self._linear, self._gram = inner[:nodes, nodes], inner[:nodes, :nodes]
-        self._values, vectors = np.linalg.eigh(inner[nodes + 1 :, nodes + 1 :])
+        nodes = len(curve.responses)
+        self._linear, self._gram = of_residual[:nodes], inner[:nodes, :nodes]
+        self._values, vectors = np.linalg.eigh(inner[nodes:, nodes:])
         self._values = np.maximum(self._values, 0.0)
-        self._of_nodes, self._of_residual = inner[:nodes, nodes + 1 :] @ vectors, inner[nodes, nodes + 1 :] @ vectors
+        self._of_nodes, self._of_residual = inner[:nodes, nodes:] @ vectors, of_residual[nodes:] @ vectors
 
     def at(self, strengths: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Log likelihood over none, and squared length of the response, at strengths."""
@@ -157,36 +208,32 @@ class _Terms:
             quadratic = quadratic - np.sum(taken * response**2, axis=1)
         return value, np.maximum(quadratic, 0.0)
 
-    def closed_in(self, coarse: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Strengths and their log likelihood: a peak sharper than the nodes lie apart is closed in on."""
-        strengths = coarse
+    def closed_in(self) -> _Likelihood:
+        """At strengths of the whole reach: a peak sharper than these lie apart is closed in on."""
+        coarse = strengths = self._curve.log_strengths()
         value, quadratic = self.at(strengths)
         for reach in _REACHES:
             at = int(np.argmax(value))
             width = max(1.0 / math.sqrt(max(float(quadratic[at]), 1e-6)), reach)
             strengths = refined(coarse, float(strengths[at]), width)
             value, quadratic = self.at(strengths)
-        return strengths, value
+        return _Likelihood(strengths, value)
 
 
-def _at_level(
-    observed: Observed, curve: Curve, start: float, level: float, sharp: _Terms
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64]] | None:
-    """Log evidence, strengths and log likelihood over none with the law off by a level; None: that moves nothing."""
-    best, none = start, observed.log_likelihood
-    coarse = curve.log_strengths()
-    found = None
+def _off_by(observed: Observed, curve: Curve, exact: _Likelihood, level: float, sharp: _Terms) -> _Likelihood | None:
+    """Log likelihood over none with the law off by a level; None: that moves nothing."""
+    best, found = exact.best, None
     for _ in range(_ROUNDS):
         wide = observed.widened(curve, best, level, chance=False)
         if wide is None:
             break
-        strengths, value = _Terms(wide, curve.over(wide.units / observed.units)).closed_in(coarse)
-        value = value + wide.log_likelihood - none
+        (terms,) = _Terms.of_each(wide, [curve.over(wide.units / observed.units)])
+        own = terms.closed_in()
+        value = own.values + wide.log_likelihood - observed.log_likelihood
         # weak strengths keep the sharp covariance: there the law's inaccuracy does nothing
-        weak = strengths < _WEAK * best
-        value = np.where(weak, sharp.at(strengths)[0], value)
-        found = log_integral(strengths, value, curve.variant.low, curve.variant.high), strengths, value
-        before, best = best, float(strengths[int(np.argmax(value))])
+        weak = own.strengths < _WEAK * best
+        found = _Likelihood(own.strengths, np.where(weak, sharp.at(own.strengths)[0], value))
+        before, best = best, found.best
         if abs(math.log(best / before)) < _SETTLED:
             break
     return found

@@ -117,7 +117,9 @@ def _weighed(
     singles = _singles(fits)
     count = max(len(singles), of_catalogue, 1)
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
-    near = [effect for effect in ranked if singles[effect].log_evidence > singles[ranked[0]].log_evidence - _NEAR]
+    # what is no likelier than none leaves nothing to others
+    least = max(max((single.log_evidence for single in singles.values()), default=0.0) - _NEAR, 0.0)
+    near = [effect for effect in ranked if singles[effect].log_evidence > least]
     left = Misfits(observed, families)
     none = left.none
     nothing = left.no_effect(misfits)

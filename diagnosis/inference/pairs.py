@@ -5,14 +5,14 @@ the first leaves. Which of two is the first makes no difference where both have 
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.curves import Curve
-from .curve_fits import CurveFit, fit_curve, log_integral, log_mean_exp, refined
+from .curve_fits import CurveFit, first_looks, fit_curve, log_integral, log_mean_exp, refined
 from .discrepancy import FARTHEST_LEVEL, LEVELS, at_most_off, leak_below, leak_density, log_frequency, only
 from .observed import Observed, Point
 
@@ -81,16 +81,10 @@ def weigh_pairs(
     for first in ranked[:leading]:
         best = singles[first].best
         point = best.at_level(min(best.level, FARTHEST_LEVEL))
-        alone = _beside_first(observed, point, first)
-        for second in singles:
-            if second == first:
-                continue
-            start, left = _beside_first(observed, point, second) if observed.has(second) else alone
-            own = curves(second, first)
-            gain = max(fit_curve(left, curve, exact=True).log_evidence for curve in own)
+        for second, evidence in _at_first_sight(observed, point, [one for one in singles if one != first], curves):
             a, b = sorted((first, second))
-            if (a, b) not in seen or start + gain > seen[a, b][0]:
-                seen[a, b] = start + gain, point, second
+            if (a, b) not in seen or evidence > seen[a, b][0]:
+                seen[a, b] = evidence, point, second
     likely = sorted(seen.values(), key=lambda item: -item[0])
     # each of the leading effects with its best companion: what one's law leaves is asked of all of them
     companions: dict[str, tuple[float, Point, str]] = {}
@@ -104,6 +98,19 @@ def weigh_pairs(
         both = {first: curves(first, other), other: curves(other, first)}
         result.append(_settled(observed, singles[first].best, point, both, other))
     return result
+
+
+def _at_first_sight(
+    observed: Observed, point: Point, others: Sequence[str], curves: Callable[[str, str], Sequence[Curve]]
+) -> Iterator[tuple[str, float]]:
+    """Every other effect with the log evidence over none of it beside a first one at its point, the priors aside."""
+    first = point.curve.effect
+    together = [[other for other in others if not observed.has(other)], *([one] for one in others if observed.has(one))]
+    for effects in filter(None, together):
+        start, left = _beside_first(observed, point, effects[0])
+        looks = first_looks(left, [curve for other in effects for curve in curves(other, first)])
+        for other in effects:
+            yield other, start + max(fit.log_evidence for fit in looks if fit.curve.effect == other)
 
 
 def _settled(
@@ -136,9 +143,8 @@ def _beside_first(observed: Observed, point: Point, other: str) -> tuple[float, 
 
 def _beside(beside: Observed, curves: Sequence[Curve]) -> CurveFit:
     """The best of an effect's variants beside another, its evidence that of all variants."""
-    first = [(fit_curve(beside, curve, exact=True).log_evidence, number) for number, curve in enumerate(curves)]
-    likely = sorted(first, reverse=True)[:_VARIANTS]
-    fits = [fit_curve(beside, curves[number], levels=_CARRIED) for _, number in likely]
+    likely = sorted(first_looks(beside, curves), key=lambda fit: -fit.log_evidence)[:_VARIANTS]
+    fits = [fit_curve(beside, fit.curve, levels=_CARRIED) for fit in likely]
     best = max(fits, key=lambda fit: fit.log_evidence)
     total = float(np.logaddexp.reduce([fit.log_evidence for fit in fits])) - math.log(len(curves))
     return replace(best, log_evidence=total, share=total - best.log_evidence)

@@ -1,6 +1,7 @@
 """Noise power to optical spread, gain and read noise.
 
 Files:
+    core_width         width of the core, where the tail spreads its light once more
     noise_power        noise power of one series
     series_scatter     whether the noise of series agrees with what is fitted to all
     spread_agreement   measured noise power against the fitted, and a second route to the gain

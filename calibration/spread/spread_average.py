@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.line.twin import OtherSpread
+from .core_width import core_before_tail_px
 from .spread_candidates import Candidate
 from .spread_members import Members, likeliest
 
@@ -102,6 +103,11 @@ class SpreadAverage:
                 moved = getattr(item.spread, name) - getattr(chosen, name)
                 reach_of_none = name == "tail_px" and min(item.spread.tail_share, chosen.tail_share) == 0
                 variance[name] += float(share) * (own + (0.0 if reach_of_none else moved**2))
+            if share > _LEAST_LIKELY:
+                # a tail that stands beside the core, or behind it: one is as likely as the other
+                variance["sigma_px"] += (
+                    0.5 * float(share) * (core_before_tail_px(item.spread) - item.spread.sigma_px) ** 2
+                )
         return {name: math.sqrt(value) for name, value in variance.items()}
 
 

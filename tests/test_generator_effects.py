@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
+from scipy.optimize import brentq
 from scipy.signal import fftconvolve
 
 from raytwin.acquisition.setting import Filter, filters_from_text, setting_from_text
@@ -987,6 +988,22 @@ def test_the_heel_changes_the_unfiltered_signal_by_its_strength_across_the_field
     down, right = across_field(series_line, bare, applied("heel", 5.0, direction_deg=90.0))
     assert right == pytest.approx(-0.05, abs=0.0015)
     assert down == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_heel_of_one_path_is_the_same_tungsten_at_every_voltage(series_line):
+    heel = applied("heel", 20.0, direction_deg=0.0, offset=0.5, curvature=0.0, fixed_path=1.0)
+
+    def passed(kV, filters, effects):
+        bare = request(setting=f"kv={kV},power_w=10,exposure_ms=20")
+        behind = request(setting=f"kv={kV},power_w=10,exposure_ms=20{filters}")
+        return float((expect(series_line, behind, effects).signal_DN / expect(series_line, bare).signal_DN)[-1].mean())
+
+    dimmed = passed(45, "", heel)
+    path_mm = brentq(lambda mm: passed(45, f",filter=W:{mm:.7f}", []) - dimmed, 1e-4, 1e-2, xtol=1e-8)
+    for kV in (60, 90):
+        assert passed(kV, "", heel) == pytest.approx(passed(kV, f",filter=W:{path_mm:.7f}", []), rel=1e-3)
+    # at the middle of the calibrated voltages it is the strength, as it is at each where the path is its own
+    assert 0.1 < 1.0 - passed(90, "", heel) < 1.0 - passed(60, "", heel) < 0.25
 
 
 @pytest.mark.parametrize(("turned", "expected"), [(180.0, (0.05, 0.0)), (90.0, (0.0, 0.05)), (360.0, (-0.05, 0.0))])

@@ -12,15 +12,12 @@ import numpy as np
 
 from ...errors import InputError
 from ..line.line_state import FloatArray, LineContext, LineState
+from ._sheets import Sheets
 from .effect import LIT_SERIES, Effect, Grid, Parameter, Shows
 
 _STATED_KEV = 45.0  # of the strength: mean energy of beams between 60 and 90 kV
 _SHEET = "Al"
-_DEPTHS = (
-    0.05,
-    0.35,
-    1.0,
-)  # of sheets that are projected, ln(1 / passed) at the stated energy; between them slopes are quadratic
+_DEPTHS = (0.05, 0.35, 1.0)  # of sheets that are projected, ln(1 / passed) at the stated energy
 _MOST = 0.999
 _OUTSIDE = -1.2  # of a border: half a diagonal and three of the widest penumbras from the middle
 
@@ -39,13 +36,6 @@ def _coverage(context: LineContext, parameters: Mapping[str, float], rotation_de
     return covered
 
 
-def _lagrange(depth: float) -> FloatArray:
-    """Weights (sheet,) of the sheets' slopes at a depth."""
-    nodes = np.array(_DEPTHS)
-    weights = [np.prod((depth - np.delete(nodes, k)) / (nodes[k] - np.delete(nodes, k))) for k in range(nodes.size)]
-    return np.array(weights, dtype=np.float64)
-
-
 def _cover(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
     request, model = context.request, context.model
     absorbed = context.since == "always"
@@ -62,18 +52,14 @@ def _cover(state: LineState, parameters: Mapping[str, float], context: LineConte
     mu = model.mu(_SHEET)
     # a beam of less than the stated energy has no such photons, and the sheet is the same
     relative = (mu / float(np.interp(_STATED_KEV, model.energies_keV, mu)))[: energies.size]
-    # the same sheets at every strength, so that scenes are projected once
-    sheets = np.exp(-np.outer((0.0, *_DEPTHS), relative))
-    rows = (context.weights[:2, None, :] * sheets).reshape(-1, energies.size)
+    sheets = Sheets(_DEPTHS, relative)
+    rows = sheets.rows(context.weights)
     depth = -math.log1p(-min(parameters["strength"] / 100.0, _MOST))
 
     def passed(sums: FloatArray) -> FloatArray:
         """Share that passes (2, row, column) of signal and variance, from sums behind each sheet."""
-        behind = np.maximum(sums.reshape(2, 1 + len(_DEPTHS), *sums.shape[1:]), 1e-300)
-        slopes = -np.log(behind[:, 1:] / behind[:, :1]) / np.reshape(_DEPTHS, (1, -1, *[1] * (sums.ndim - 1)))
-        thick = parameters["sheet_share"] * depth
-        slope = np.tensordot(slopes, _lagrange(thick), axes=(1, 0))
-        return np.asarray(np.exp(-(1.0 - parameters["sheet_share"]) * depth - thick * slope))
+        grey = math.exp(-(1.0 - parameters["sheet_share"]) * depth)
+        return grey * sheets.passed(sums, parameters["sheet_share"] * depth)
 
     covered = _coverage(context, parameters, request.panel_rotation_deg)
     signal, variance = 1.0 - covered * (1.0 - passed(context.project("grey_absorber", rows)))

@@ -15,6 +15,7 @@ from raytwin.cli import main
 from raytwin.files import sha256_of_file
 from raytwin.generator.predictions.predict import predict_flatfield
 from raytwin.lab.protocols import run_protocol
+from raytwin.lab.unkindness import NONE
 
 
 @pytest.fixture(scope="module")
@@ -197,3 +198,38 @@ def test_every_spectrum_is_at_hand_before_frames_are_read(session, monkeypatch):
         calibrate_twin(acquisition, rng=np.random.default_rng(2), progress=stages.append)
     assert {stage for stage, _ in asked} == {"spectra"}
     assert stages.index("spectra") < stages.index("darks")
+
+
+def test_the_noise_of_a_twins_maps_is_what_a_second_day_shows(tmp_path):
+    twins = []
+    for day in (0, 1):
+        path = tmp_path / f"day{day}.h5"
+        run_protocol(
+            path,
+            protocol="calibration",
+            seed=77,
+            session=day,
+            rows=64,
+            columns=64,
+            frames=8,
+            families=(),
+            unkindness=NONE,
+        )
+        with open_acquisition(path) as acquisition:
+            twins.append(calibrate_twin(acquisition, rng=np.random.default_rng(day)))
+    first, second = twins
+    good = (first.maps.bad_pixels == 0) & (second.maps.bad_pixels == 0)
+    electronic_DN2 = first.noise.read_noise_DN.value**2
+    for exposure_ms in (first.maps.dark_exposure_ms, 5.0 * first.maps.dark_exposure_ms):
+        change = (second.maps.dark_at(exposure_ms) - first.maps.dark_at(exposure_ms))[good]
+        expected = electronic_DN2 * sum(twin.maps.dark_noise_at(exposure_ms) for twin in twins)
+        assert np.var(change) == pytest.approx(expected, rel=0.1)
+    for one, other in zip(first.levels, second.levels, strict=True):
+        change = (other.flat_shape - one.flat_shape)[good]
+        expected = sum(
+            level.photon_transfer_slope_DN.value / (level.signal_DN * level.exposures)
+            + electronic_DN2 * (1.0 / level.exposures + level.dark_noise) / level.signal_DN**2
+            for level in (one, other)
+        )
+        # white noise that follows the signal comes on top
+        assert np.var(change) == pytest.approx(expected, rel=0.15)

@@ -171,6 +171,7 @@ def levels_of(
         for item, total in members:
             shape_sum += (total.mean_DN - darks.of(item)) * total.frames
         centre = float(np.median(shape_sum[good]))
+        frames = sum(total.frames for _, total in members)
         flat_shape = shape_sum / centre if centre > 0 else np.ones(good.shape)
         first = members[0][0]
         distance = first.source_detector_mm or acquisition.instrument.source_detector_mm
@@ -187,6 +188,9 @@ def levels_of(
                 flat_shape=flat_shape.astype(np.float32),
                 series=tuple(item.name for item, _ in members),
                 role="calibration",
+                exposures=frames**2 / sum(total.frames / item.averaged for item, total in members),
+                signal_DN=max(centre, 0.0) / frames,
+                dark_noise=darks.noise_under([(item, total.frames / frames) for item, total in members]),
             )
         )
     return tuple(levels)

@@ -503,6 +503,7 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
             gain_relative=gain_map.astype(np.float32),
             read_variance_DN2=read_map.astype(np.float32),
             bad_pixels=flats.bad,
+            dark_noise=darks.noise_at(last, exposure_ms),
         ),
         noise=NoiseModel(
             spread=spread_estimate(fit),

@@ -1,7 +1,7 @@
 """Dark frames of a session: their mean by exposure time, growth and noise; what they say of dark level and read noise."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -100,6 +100,53 @@ class DarkFrames:
         nearest = min(known, key=lambda key: abs(key - exposure_ms))
         return np.asarray(exposures[nearest] + self.per_ms * (exposure_ms - nearest))
 
+    def noise_at(self, session: int, exposure_ms: float | None) -> tuple[float, float, float] | None:
+        """Noise of `at` and of what grows from it, as `DetectorMaps.dark_noise` has it; None: the dark was subtracted before."""
+        exposures = {
+            key: sum(total.frames * one.averaged for one, total in self.sums if (one.session, one.exposure_ms) == key)
+            for key in self.by_exposure
+        }
+        sessions = sorted({key[0] for key in self.by_exposure}, key=lambda one: (abs(one - session), one))
+        own = (sessions[0], exposure_ms)
+        if not exposures.get(own):
+            return None
+        weights, denominator = _growth_weights({key: count for key, count in exposures.items() if count})
+        growth = {key: weight / denominator for key, weight in weights.items()} if denominator > 0 else {}
+        return (
+            1.0 / exposures[own],
+            2.0 * growth.get(own, 0.0) / exposures[own],
+            sum(weight**2 / exposures[key] for key, weight in growth.items()),
+        )
+
+    def noise_under(self, shares: Sequence[tuple[Series, float]]) -> float:
+        """Variance that noise of the darks gives a pixel of a weighted mean of series, over that of one exposure; growth apart."""
+        together: dict[tuple[int, float | None], tuple[float, int]] = {}
+        for item, share in shares:
+            key, count = self.key_of(item), self.exposures_of(item)
+            if key is not None and count:
+                together[key] = together.get(key, (0.0, count))[0] + share, count
+        return sum(share**2 / count for share, count in together.values())
+
+
+def _growth_weights(
+    counts: Mapping[tuple[int, float | None], float],
+) -> tuple[dict[tuple[int, float | None], float], float]:
+    """Weight of each mean dark in the growth with exposure, by session and exposure, and what their sum is divided by.
+
+    A line in each session, one slope for all; counts: weight of each dark in its session's line.
+    """
+    weights: dict[tuple[int, float | None], float] = {}
+    denominator = 0.0
+    for session in {key[0] for key in counts}:
+        times = {key: key[1] for key in counts if key[0] == session and key[1] is not None}
+        if len(times) < 2:
+            continue
+        middle = sum(counts[key] * time for key, time in times.items()) / sum(counts[key] for key in times)
+        for key, time in times.items():
+            weights[key] = counts[key] * (time - middle)
+            denominator += counts[key] * (time - middle) ** 2
+    return weights, denominator
+
 
 def sum_darks(series: Sequence[Series], shape: tuple[int, int], sums_of: Callable[[Series], KeptSums]) -> DarkFrames:
     """Dark frames of series of one shape (row, column)."""
@@ -112,21 +159,10 @@ def sum_darks(series: Sequence[Series], shape: tuple[int, int], sums_of: Callabl
         key: np.asarray(sum(total.mean_DN * total.frames for total in totals) / frames[key])
         for key, totals in grouped.items()
     }
-    # growth with exposure: a line in each session, one slope
     per_ms = np.zeros(shape)
-    denominator = 0.0
-    for session in {key[0] for key in grouped}:
-        keys = [key for key in grouped if key[0] == session and key[1] is not None]
-        if len(keys) < 2:
-            continue
-        times = np.array([key[1] for key in keys], dtype=np.float64)
-        weights = np.array([frames[key] for key in keys], dtype=np.float64)
-        centred = times - np.average(times, weights=weights)
-        denominator += float(np.sum(weights * centred**2))
-        for weight, offset, key in zip(weights, centred, keys, strict=True):
-            per_ms += weight * offset * by_exposure[key]
-    if denominator > 0:
-        per_ms /= denominator
+    weights, denominator = _growth_weights(frames)
+    for key, weight in weights.items():
+        per_ms += weight / denominator * by_exposure[key]
     variance = np.full(shape, np.nan)
     pairs = [(item, total) for item, total in sums if total.pairs > 0]
     effective = sum(effective_frames(total.frames) for _, total in pairs)

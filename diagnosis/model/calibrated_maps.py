@@ -78,11 +78,15 @@ class CalibratedMaps:
         return sum(known) / len(known) if known else None
 
     def dark_noise(self, item: SessionSeries, signal_DN: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Variance, DN^2, that noise of the calibrating darks gives a pixel of a corrected mean frame, through the gain map as well.
+        """Variance, DN^2, that noise of darks gives a pixel of a corrected mean frame; of calibrating ones through the gain map too.
 
         signal_DN: of the series, of any shape, which the result has.
         """
         under = self.darks.weights_under(item)
+        twin = self.darks.twin
+        if not under and "offset" not in item.series.corrected:
+            share = twin.maps.dark_noise_at(item.series.exposure_ms)
+            return np.full(np.shape(signal_DN), share * twin.noise.read_noise_DN.value**2)
         divided = item.request.beam_on and "gain" not in item.series.corrected
         total = np.zeros(np.shape(signal_DN))
         for name, white_DN2 in self.darks.white_DN2.items():
@@ -143,6 +147,9 @@ def calibrated_maps(
     shares = _flat_shares(flats, expected, frames, good)
     gain = np.zeros(good.shape) if flats else _gain_of_twin(twin)
     quantum = white = 0.0
+    if not flats:
+        beams = [expected[item.name] for item in kept if item.request.beam_on and item.name in expected]
+        quantum, white = _gain_noise_of_twin(twin, [mean_over(model.signal_DN, good) for model in beams])
     gain_darks = dict.fromkeys(under.white_DN2, 0.0)
     for item in flats:
         model = expected[item.name]
@@ -213,6 +220,23 @@ def _gain_of_twin(twin: Twin) -> NDArray[np.float64]:
     if shapes:
         gain = np.asarray(np.mean(np.stack(shapes), axis=0), dtype=np.float64)
     return gain
+
+
+def _gain_noise_of_twin(twin: Twin, signals_DN: Sequence[float]) -> tuple[float, float]:
+    """Relative variance of one pixel of `_gain_of_twin` by noise: of quanta, and white.
+
+    A flat that does not say of how many exposures it is the mean counts as one exposure at the middle of `signals_DN`, the
+    session's.
+    """
+    usual_DN = float(np.median(signals_DN)) if signals_DN else 0.0
+    quantum = white = 0.0
+    for level in twin.levels:
+        signal_DN, exposures = level.signal_DN or usual_DN, level.exposures or 1.0
+        if signal_DN > 0.0:
+            quantum += level.photon_transfer_slope_DN.value / (signal_DN * exposures)
+            white += (1.0 / exposures + (level.dark_noise or 0.0)) * (twin.noise.read_noise_DN.value / signal_DN) ** 2
+    count = max(len(twin.levels), 1)
+    return quantum / count**2, white / count**2
 
 
 def _beams_of_twin(

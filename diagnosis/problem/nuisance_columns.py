@@ -333,14 +333,16 @@ def _of_thickness(
 def _gain_map_noise(session: SessionModel, probes: SeriesProbes, signal: NDArray[np.float64]) -> Columns:
     """Smooth noise of the gain map by shape: what few calibrating frames leave of it is the same in every series.
 
-    Empty where the series has no part in it: without calibrating flats, before the beam, for those that calibrate, and where the
-    gain map was applied before. signal: expected (row, column), DN.
+    Empty where the series has no part in it: before the beam, for those that calibrate, and where the gain map was applied before.
+    signal: expected (row, column), DN.
     """
     item, maps = probes.series.session, session.maps
-    if not maps.shares or not item.request.beam_on or item.calibrates or "gain" in item.series.corrected:
+    if not item.request.beam_on or item.calibrates or "gain" in item.series.corrected:
         return {}
     # relative, of one pixel's gain in sums over many pixels
     lasting = maps.gain_white + maps.gain_quantum * correlation_sum(probes.series.expected, BLOCK_PX, BLOCK_PX)
+    if lasting <= 0.0:
+        return {}
     pixel_sd = math.sqrt(lasting)
     waves = _waves(signal.shape, scales.PATTERN_WAVES + 1)  # as of a changed map; the level has nuisances of its own
     amounts = [pixel_sd / math.sqrt(float(np.sum(wave**2))) * wave for wave in waves.values()]

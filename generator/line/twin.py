@@ -115,7 +115,9 @@ class Level(ByValue):
     Fields: kV (None where unknown), filters; gain_DN (variance per signal, the spread's share restored);
     photon_transfer_slope_DN (variance of one pixel per signal, as measured); rate_DN_per_mAs (detector median above
     dark at source_detector_mm; None where the tube load is unknown); saturation_DN (None where none was seen);
-    flat_shape (row, column): signal relative to the detector median.
+    flat_shape (row, column): signal relative to the detector median; series: that it comes from; exposures: of how many it is
+    the mean; signal_DN: the median's signal in each; dark_noise: variance of a pixel of the dark subtracted from it over that of
+    one exposure (None: not known).
     """
 
     kV: float | None
@@ -128,6 +130,9 @@ class Level(ByValue):
     flat_shape: NDArray[np.float32]
     series: tuple[str, ...]
     role: str
+    exposures: float | None = None
+    signal_DN: float | None = None
+    dark_noise: float | None = None
 
     @property
     def name(self) -> str:
@@ -221,7 +226,9 @@ class NoiseModel:
 class DetectorMaps(ByValue):
     """Maps (row, column): dark at `dark_exposure_ms`, its growth a ms, relative gain, read variance, bad pixels.
 
-    gain_relative is the pixel's gain over the detector median, shrunk towards 1 as far as the data are thin.
+    gain_relative is the pixel's gain over the detector median, shrunk towards 1 as far as the data are thin. dark_noise (a, b, c):
+    the variance that noise gives a pixel of the dark t ms longer than `dark_exposure_ms` is a + b t + c t^2 of one exposure's;
+    None: not known.
     """
 
     dark_DN: NDArray[np.float32]
@@ -230,6 +237,7 @@ class DetectorMaps(ByValue):
     gain_relative: NDArray[np.float32]
     read_variance_DN2: NDArray[np.float32]
     bad_pixels: NDArray[np.uint8]
+    dark_noise: tuple[float, float, float] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -241,6 +249,16 @@ class DetectorMaps(ByValue):
         if exposure_ms is None or self.dark_exposure_ms is None:
             return self.dark_DN
         return np.asarray(self.dark_DN + self.dark_DN_per_ms * np.float32(exposure_ms - self.dark_exposure_ms))
+
+    def dark_noise_at(self, exposure_ms: float | None) -> float:
+        """Variance of a pixel of `dark_at` over that of one exposure; 1 where it is not known."""
+        if self.dark_noise is None:
+            return 1.0
+        longer = 0.0
+        if exposure_ms is not None and self.dark_exposure_ms is not None:
+            longer = exposure_ms - self.dark_exposure_ms
+        same, mixed, grown = self.dark_noise
+        return max(same + mixed * longer + grown * longer**2, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

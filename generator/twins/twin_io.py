@@ -43,6 +43,7 @@ _LARGEST_EXPONENT = math.log(sys.float_info.max)
 TUBE = "tube"
 _SDS_OF_EFFECTS = ("strength_sd", "law_sd")
 _SHAPE_OF_SPREAD = ("aspect", "tail_share", "tail_px", "tail_order", "absorption_per_px")
+_OF_LEVELS = ("source_detector_mm", "saturation_DN", "exposures", "signal_DN", "dark_noise")
 _MAPS = ("dark_DN", "dark_DN_per_ms", "gain_relative", "read_variance_DN2", BAD_PIXEL_MAP)
 
 
@@ -125,6 +126,8 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
         file.attrs.update({"NX_class": "NXroot", "default": "maps"})
         if twin.maps.dark_exposure_ms is not None:
             maps.attrs["dark_exposure_ms"] = twin.maps.dark_exposure_ms
+        if twin.maps.dark_noise is not None:
+            maps.attrs["dark_noise"] = twin.maps.dark_noise
         noise = file.create_group("noise")
         spread = twin.noise.spread
         noise.attrs["psf_model"] = spread.value.model
@@ -155,7 +158,7 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
             group.attrs["role"] = level.role
             for name in ("gain_DN", "photon_transfer_slope_DN", "rate_DN_per_mAs"):
                 _put_estimate(group, name, getattr(level, name))
-            for name in ("source_detector_mm", "saturation_DN"):
+            for name in _OF_LEVELS:
                 if getattr(level, name) is not None:
                     group.attrs[name] = getattr(level, name)
             group.create_dataset("flat_shape", data=level.flat_shape, compression="gzip", shuffle=True)
@@ -293,8 +296,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
                     _get_estimate(group, "photon_transfer_slope_DN"), "photon_transfer_slope_DN", path
                 ),
                 rate_DN_per_mAs=_get_estimate(group, "rate_DN_per_mAs"),
-                source_detector_mm=_optional_float(group, "source_detector_mm"),
-                saturation_DN=_optional_float(group, "saturation_DN"),
+                **{name: _optional_float(group, name) for name in _OF_LEVELS},
                 flat_shape=_array(group, "flat_shape", np.float32),
                 series=_texts(group.attrs["series"]),
                 role=_text(group.attrs["role"]),
@@ -321,6 +323,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
             gain_relative=_array(maps, "gain_relative", np.float32),
             read_variance_DN2=_array(maps, "read_variance_DN2", np.float32),
             bad_pixels=bad,
+            dark_noise=_dark_noise(maps, path),
         ),
         noise=NoiseModel(
             spread=_spread(noise, path),
@@ -440,3 +443,13 @@ def _correction(group: Any) -> SpectrumCorrection | None:
 
 def _optional_float(group: Any, name: str) -> float | None:
     return float(group.attrs[name]) if name in group.attrs else None
+
+
+def _dark_noise(maps: Any, path: object) -> tuple[float, float, float] | None:
+    """Noise of the dark; files before raytwin 0.3 do not say it."""
+    if "dark_noise" not in maps.attrs:
+        return None
+    values = np.atleast_1d(np.asarray(maps.attrs["dark_noise"], dtype=np.float64))
+    if values.shape != (3,) or not np.all(np.isfinite(values)):
+        raise FileFormatError(f"dark_noise of twin {path}", received=f"{values.tolist()}", expected="three numbers")
+    return float(values[0]), float(values[1]), float(values[2])

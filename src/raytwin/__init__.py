@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from .api.beams import mu as mu
     from .api.beams import spectrum as spectrum
     from .api.campaigns import sweep as sweep
-    from .api.curves import compare as compare
+    from .api.comparisons import compare as compare
     from .api.curves import fit_pod as fit_pod
-    from .api.curves import plan as plan
     from .api.images import detect as detect
     from .api.images import generate as generate
     from .api.images import read_dataset as read_dataset
@@ -37,6 +36,7 @@ if TYPE_CHECKING:
     from .api.sessions import check as check
     from .api.sessions import diagnose as diagnose
     from .api.sessions import lab_session as lab_session
+    from .api.study_plans import plan as plan
     from .api.twins import calibrate as calibrate
     from .api.twins import open_acquisition as open_acquisition
     from .api.twins import predict as predict
@@ -52,7 +52,7 @@ _HOME = {
     "calibrate": "api.twins",
     "calibrate_observer": "api.observers",
     "check": "api.sessions",
-    "compare": "api.curves",
+    "compare": "api.comparisons",
     "contrast": "api.beams",
     "detect": "api.images",
     "diagnose": "api.sessions",
@@ -65,7 +65,7 @@ _HOME = {
     "mu": "api.beams",
     "observe": "api.observers",
     "open_acquisition": "api.twins",
-    "plan": "api.curves",
+    "plan": "api.study_plans",
     "predict": "api.twins",
     "read_dataset": "api.images",
     "read_twin": "api.twins",

@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ..api.curves import compare
+from ..api.comparisons import compare
 from ..files import whole_file
 from ._answer import answer, say
 from ._pod_answer import shown, where_from_options

@@ -8,7 +8,7 @@ informative trials expect a longer interval.
 import argparse
 from typing import Any
 
-from ..api.curves import plan
+from ..api.study_plans import plan
 from ..results import counted
 from ._answer import answer, say
 from ._pod_answer import shown

@@ -3,7 +3,9 @@
 Files:
     setting               tube voltage, load, filter, exposure, and their text form
     instrument            the line as its owner describes it
-    acquisition_io        the acquisition file
+    acquisition_io        the acquisition file; _acquisition_words: its words
+    acquisition_writer    series and scenes as they are written
+    instrument_io         the instrument in a file
     dataset_io            the dataset file
     pairs                 dark and flat correction, pairs by scene
     contrast              contrast of a foreign object in a pair
@@ -42,13 +44,12 @@ from .setting import Filter, Setting, filter_from_text, filters_from_text, setti
 if TYPE_CHECKING:
     from .acquisition_io import (
         AcquisitionFile,
-        AcquisitionWriter,
         Scene,
         Series,
-        SeriesWriter,
         open_acquisition,
         write_acquisition,
     )
+    from .acquisition_writer import AcquisitionWriter, SeriesWriter
     from .contrast import (
         delta_r,
         dilations_for_pixel,
@@ -93,10 +94,10 @@ _LAZY = {
     "delta_r": "contrast",
     "dilations_for_pixel": "contrast",
     "AcquisitionFile": "acquisition_io",
-    "AcquisitionWriter": "acquisition_io",
+    "AcquisitionWriter": "acquisition_writer",
     "Scene": "acquisition_io",
     "Series": "acquisition_io",
-    "SeriesWriter": "acquisition_io",
+    "SeriesWriter": "acquisition_writer",
     "open_acquisition": "acquisition_io",
     "write_acquisition": "acquisition_io",
     "Dataset": "dataset_io",

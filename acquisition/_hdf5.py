@@ -206,6 +206,18 @@ def reading(where: str) -> Iterator[None]:
         ) from None
 
 
+@contextmanager
+def named(where: str, kind: type[InputError] = FileFormatError) -> Iterator[None]:
+    """Errors of a setting or a label are told with the file and series they stand in; kind: as which they are raised."""
+    try:
+        yield
+    except FileFormatError:
+        raise
+    except InputError as error:
+        argument = error.argument if error.argument.startswith(where) else f"{where}, {error.argument}"
+        raise kind(argument, received=error.received, expected=error.expected, remedy=error.remedy) from None
+
+
 def real_numbers(values: Any, dtype: Any, *, where: str) -> NDArray[Any]:
     """An array of real numbers in a type of the caller's; what that type cannot hold becomes infinite, without a warning.
 

@@ -2,9 +2,9 @@
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType, TracebackType
 from typing import Any, Self, TypeVar
 
@@ -12,17 +12,17 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileFormatError, InputError, check_number
+from ..errors import FileFormatError
 from ..files import whole_file
 from ..results import Table, counted
+from ._acquisition_words import CORRECTIONS, ERROR, FORMAT, KINDS, PANEL_LAYERS, ROLES, VERSION, text_from_shape
 from ._hdf5 import (
     check_format,
     check_open,
     check_stored,
     child,
     frames_per_piece,
-    mark_as_entry,
-    mark_as_pictures,
+    named,
     number_attribute,
     open_hdf5,
     plain_attributes,
@@ -31,22 +31,15 @@ from ._hdf5 import (
     text_attribute,
     whole_attribute,
 )
-from .instrument import BOOLEAN_FIELDS, LAYER_FIELDS, TEXT_FIELDS, WHOLE_FIELDS, Instrument
-from .setting import Filter, Setting, filters_from_text, text_from_filters
+from .acquisition_writer import AcquisitionWriter, written_acquisition
+from .instrument import Instrument
+from .instrument_io import filters_attribute, read_instrument
+from .setting import Filter, Setting
 
-FORMAT = "raytwin-acquisition"
-VERSION = 1
-KINDS = ("dark", "flat", "object", "afterglow")
-SCENE_KINDS = ("wedge", "slab", "edge", "disc", "product")
-CORRECTIONS = ("offset", "gain", "defects", "log")
-ROLES = ("calibration", "evaluation")
-PANEL_LAYERS = ("front", "back")
-ERROR = "error"  # attribute of a series without frames: why an importer went on without it
 PIECE_BYTES = 64 * 2**20
 
 _Made = TypeVar("_Made")
 _LARGEST_EXACT_FLOAT32 = 2**24
-_CHUNK_BYTES = 2**17
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -313,22 +306,28 @@ def open_acquisition(path: str | os.PathLike[str], *, damage: list[FileFormatErr
         raise
 
 
-def _each(
-    group: Any, path: str, make: Callable[..., _Made], damage: list[FileFormatError] | None
-) -> list[tuple[str, _Made]]:
-    """What `make` makes of every member of a group, by name; members at fault go to `damage` where that is a list."""
-    made = []
-    for name in group:
-        try:
-            if isinstance(name, bytes):  # h5py's way to hand out what is no text
-                raise FileFormatError(path, received=f"a name that is no text, {name!r}", expected="names in UTF-8")
-            with reading(f"{path}, {name}"):
-                made.append((name, make(group, name, path=path)))
-        except FileFormatError as error:
-            if damage is None:
-                raise
-            damage.append(error)
-    return made
+@contextmanager
+def write_acquisition(
+    path: str | os.PathLike[str], instrument: Instrument | None = None, *, compression: str | None = None
+) -> Iterator[AcquisitionWriter]:
+    """Write an acquisition file in a `with` block; it appears under its name when the block succeeds, or not at all.
+
+    Args:
+        path: the file to write; an existing one is replaced.
+        instrument: what is known about the line.
+        compression: None (fastest), `lzf` or `gzip`, for the frames.
+
+    Raises:
+        InputError: what was written does not make a valid file (no series, a series without frames, masks of
+            another shape, an attribute out of range).
+    """
+    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+
+        def check() -> object:  # the reader's own checks, so that nothing is written that could not be read
+            return _acquisition(file, path=str(path))
+
+        with written_acquisition(file, instrument or Instrument(), compression=compression, check=check) as writer:
+            yield writer
 
 
 def _acquisition(file: Any, *, path: str, damage: list[FileFormatError] | None = None) -> AcquisitionFile:
@@ -346,8 +345,8 @@ def _acquisition(file: Any, *, path: str, damage: list[FileFormatError] | None =
         if scene is not None and scene.shape not in (None, series.shape):
             error = FileFormatError(
                 f"{path}, scene {scene.name}",
-                received=f"masks or maps of {_by(scene.shape)} pixels",
-                expected=f"{_by(series.shape)} pixels as in the frames of series {series.name}",
+                received=f"masks or maps of {text_from_shape(scene.shape)} pixels",
+                expected=f"{text_from_shape(series.shape)} pixels as in the frames of series {series.name}",
                 remedy="give masks on the detector's own pixels",
             )
             if damage is None:
@@ -371,8 +370,22 @@ def _acquisition(file: Any, *, path: str, damage: list[FileFormatError] | None =
     )
 
 
-def _by(shape: Sequence[int] | None) -> str:
-    return "?" if shape is None else " x ".join(str(length) for length in shape)
+def _each(
+    group: Any, path: str, make: Callable[..., _Made], damage: list[FileFormatError] | None
+) -> list[tuple[str, _Made]]:
+    """What `make` makes of every member of a group, by name; members at fault go to `damage` where that is a list."""
+    made = []
+    for name in group:
+        try:
+            if isinstance(name, bytes):  # h5py's way to hand out what is no text
+                raise FileFormatError(path, received=f"a name that is no text, {name!r}", expected="names in UTF-8")
+            with reading(f"{path}, {name}"):
+                made.append((name, make(group, name, path=path)))
+        except FileFormatError as error:
+            if damage is None:
+                raise
+            damage.append(error)
+    return made
 
 
 _SERIES_WORDS = {
@@ -412,7 +425,9 @@ def _series(group: Any, name: str, *, path: str) -> Series:
         raise FileFormatError(where, received="no dataset `frames`", expected="frames (n, row, column)")
     if frames.ndim != 3 or 0 in frames.shape:
         raise FileFormatError(
-            f"{where}/frames", received=f"shape ({_by(frames.shape)})", expected="at least one frame, (n, row, column)"
+            f"{where}/frames",
+            received=f"shape ({text_from_shape(frames.shape)})",
+            expected="at least one frame, (n, row, column)",
         )
     if frames.dtype.kind not in "iuf":
         raise FileFormatError(
@@ -446,7 +461,7 @@ def _series(group: Any, name: str, *, path: str) -> Series:
     kV, current_mA, power_W = load("kV", "kV"), load("current_mA", "mA"), load("power_W", "W")
     # 0 ms: shorter than the clock tells, or the light is pulsed; there is then no load and no setting
     exposure_ms = number_attribute(node, "exposure_ms", where=where, lowest=0, unit="ms")
-    filters = _layers(node, "filter", where=where) or ()
+    filters = filters_attribute(node, "filter", where=where) or ()
     averaged = whole_attribute(node, "averaged", where=where, lowest=1) or 1
     source_detector_mm = positive("source_detector_mm", "mm")
     setting = None
@@ -507,30 +522,6 @@ def _series(group: Any, name: str, *, path: str) -> Series:
     )
 
 
-@contextmanager
-def named(where: str, kind: type[InputError] = FileFormatError) -> Iterator[None]:
-    """Errors of a setting or a label are told with the file and series they stand in; kind: as which they are raised."""
-    try:
-        yield
-    except FileFormatError:
-        raise
-    except InputError as error:
-        argument = error.argument if error.argument.startswith(where) else f"{where}, {error.argument}"
-        raise kind(argument, received=error.received, expected=error.expected, remedy=error.remedy) from None
-
-
-def _layers(node: Any, name: str, *, where: str) -> tuple[Filter, ...] | None:
-    text = text_attribute(node, name, where=where)
-    if text is None:
-        return None
-    try:
-        return filters_from_text(text)
-    except InputError as error:
-        raise FileFormatError(
-            f"{where}, {name}", received=error.received, expected=error.expected, remedy=error.remedy
-        ) from None
-
-
 def _times(node: Any, *, n_frames: int, where: str) -> NDArray[np.float64] | None:
     dataset = child(node, "time_s")
     if dataset is None:
@@ -542,7 +533,9 @@ def _times(node: Any, *, n_frames: int, where: str) -> NDArray[np.float64] | Non
     if time_s.shape != (n_frames,) or not bool(np.all(np.isfinite(time_s))) or bool(np.any(np.diff(time_s) < 0)):
         raise FileFormatError(
             f"{where}/time_s",
-            received=f"{_by(time_s.shape)} values" if time_s.shape != (n_frames,) else "times that are not in order",
+            received=f"{text_from_shape(time_s.shape)} values"
+            if time_s.shape != (n_frames,)
+            else "times that are not in order",
             expected=f"{n_frames} finite times in s that never fall",
         )
     time_s.setflags(write=False)
@@ -572,12 +565,12 @@ def _scene(group: Any, name: str, *, path: str) -> Scene:
         if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 2 or dataset.dtype.kind not in "iufb":
             raise FileFormatError(
                 f"{where}/{plane}",
-                received=f"shape ({_by(getattr(dataset, 'shape', None))})",
+                received=f"shape ({text_from_shape(getattr(dataset, 'shape', None))})",
                 expected="an array of numbers (row, column)",
             )
         shapes[plane] = (int(dataset.shape[0]), int(dataset.shape[1]))
     if len(set(shapes.values())) > 1:
-        told = ", ".join(f"{plane} {_by(shape)}" for plane, shape in shapes.items())
+        told = ", ".join(f"{plane} {text_from_shape(shape)}" for plane, shape in shapes.items())
         raise FileFormatError(where, received=told, expected="masks and maps of one shape")
     known = {"kind", "product", "foreign_object", "size_mm"}
     size_mm = node.attrs.get("size_mm")
@@ -599,32 +592,6 @@ def _scene(group: Any, name: str, *, path: str) -> Scene:
         _product_mask=masks["product_mask"],
         _where=where,
     )
-
-
-def read_instrument(node: Any, *, path: str) -> Instrument:
-    """The instrument in the attributes of an HDF5 group; None: nothing is known.
-
-    Raises:
-        FileFormatError: an attribute of another type, or out of range.
-    """
-    if node is None:
-        return Instrument()
-    where = f"{path}, instrument"
-    values: dict[str, Any] = {}
-    for field in fields(Instrument):
-        if field.name in LAYER_FIELDS:
-            values[field.name] = _layers(node, field.name, where=where)
-        elif field.name in TEXT_FIELDS:
-            values[field.name] = text_attribute(node, field.name, where=where) or None
-        elif field.name in (*WHOLE_FIELDS, *BOOLEAN_FIELDS):
-            values[field.name] = whole_attribute(node, field.name, where=where)
-        else:
-            values[field.name] = number_attribute(node, field.name, where=where)
-    for name in BOOLEAN_FIELDS:
-        if values[name] is not None:
-            values[name] = bool(values[name])
-    with named(path):
-        return Instrument(**values)
 
 
 def _missing(series: tuple[Series, ...], instrument: Instrument, *, unnumbered: int) -> tuple[str, ...]:
@@ -657,369 +624,3 @@ def _missing(series: tuple[Series, ...], instrument: Instrument, *, unnumbered: 
     if instrument.scintillator is None:
         told.append("no scintillator: the default of the twin is assumed")
     return tuple(told)
-
-
-class SeriesWriter:
-    """Appends frames to one series of the file being written."""
-
-    def __init__(self, group: Any, *, name: str, dataset: Any) -> None:
-        self.name = name
-        self._group = group
-        self._dataset = dataset
-        self._time_s: list[float] = []
-
-    @property
-    def n_frames(self) -> int:
-        """How many frames have been written."""
-        return int(self._dataset.shape[0])
-
-    def append(self, frames: NDArray[Any], *, time_s: float | Sequence[float] | NDArray[Any] | None = None) -> None:
-        """Append one frame (row, column) or several (m, row, column), with their times (s) where they are known.
-
-        Raises:
-            InputError: another shape, a value that is not finite, or one that the series' type cannot hold.
-        """
-        block = np.asarray(frames)
-        if block.ndim == 2:
-            block = block[None]
-        if block.ndim != 3 or block.shape[1:] != self._dataset.shape[1:]:
-            raise InputError(
-                f"frames of series {self.name}",
-                received=f"shape ({_by(block.shape)})",
-                expected=f"frames of {_by(self._dataset.shape[1:])} pixels as before",
-            )
-        block = _storable(block, self._dataset.dtype, name=self.name)
-        times = [] if time_s is None else np.atleast_1d(np.asarray(time_s, dtype=np.float64)).tolist()
-        if time_s is not None and len(times) != len(block):
-            raise InputError(
-                f"time_s of series {self.name}", received=f"{len(times)} times", expected=f"{len(block)}, one a frame"
-            )
-        before = self.n_frames
-        self._dataset.resize(before + len(block), axis=0)
-        self._dataset[before:] = block
-        self._time_s += times
-
-    def _finish(self) -> None:
-        timed = len(self._time_s) == self.n_frames > 0
-        if self._time_s:
-            self._group.create_dataset("time_s", data=np.asarray(self._time_s, dtype=np.float64))
-        mark_as_pictures(self._group, "frames", axes=("time_s", ".", ".") if timed else ())
-
-
-class AcquisitionWriter:
-    """An acquisition file being written; made by `write_acquisition`."""
-
-    def __init__(self, file: Any, *, compression: str | None) -> None:
-        self.attributes: Any = file.attrs
-        self._compression = compression
-        self._series = file.create_group("series")
-        self._scenes = file.require_group("scenes")
-        self._writers: list[SeriesWriter] = []
-        self._left_out: dict[str, FileFormatError] = {}
-        self._next_index = 0
-
-    @property
-    def scene_names(self) -> tuple[str, ...]:
-        """The scenes that have been added."""
-        return tuple(self._scenes)
-
-    def leave_out(self, name: str, error: FileFormatError) -> None:
-        """Put a series' error in its place, where an importer goes on without what it cannot read; readers raise it."""
-        if name in self._series:
-            del self._series[name]
-        self._writers = [writer for writer in self._writers if writer.name != name]
-        self._left_out[name] = error
-
-    def _mark_left_out(self) -> None:
-        for name, error in self._left_out.items():
-            group = self._series.require_group(name)
-            group.attrs[ERROR] = [error.argument, str(error.received), error.expected, error.remedy]
-
-    def add_series(
-        self,
-        name: str,
-        *,
-        kind: str,
-        frames: NDArray[Any] | Iterable[NDArray[Any]] | None = None,
-        shape: tuple[int, int] | None = None,
-        dtype: Any = None,
-        chunk_frames: int | None = None,
-        index: int | None = None,
-        setting: Setting | None = None,
-        kV: float | None = None,
-        exposure_ms: float | None = None,
-        current_mA: float | None = None,
-        power_W: float | None = None,
-        filters: Iterable[Filter] | None = None,
-        averaged: int | None = None,
-        frame_interval_ms: float | None = None,
-        belt_speed_mm_s: float | None = None,
-        panel_rotation_deg: float | None = None,
-        source_object_mm: float | None = None,
-        source_detector_mm: float | None = None,
-        photons_per_pixel: float | None = None,
-        scene: str = "",
-        corrected: Iterable[str] = (),
-        role: str | None = None,
-        layer: str | None = None,
-        time_s: NDArray[Any] | Sequence[float] | None = None,
-    ) -> SeriesWriter:
-        """Start a series, with its frames at once or with `append` on what is returned.
-
-        Args:
-            name: unique in the file, without `/`.
-            kind: `dark`, `flat`, `object` or `afterglow`.
-            frames: (n, row, column), one frame (row, column), or an iterable of such arrays; None: append later.
-            shape: (row, column), needed where `frames` is None.
-            dtype: uint16 or float32; by default uint16 for integers and float32 for the rest.
-            chunk_frames: frames a chunk of the file holds; by default 1, more where frames are tiny.
-            index: order in time; by default after the series added before.
-            setting: the setting as one value; or the single attributes instead, each None where unknown: kV; exposure_ms;
-                current_mA or power_W; filters; averaged (frames averaged into each); frame_interval_ms; belt_speed_mm_s.
-            panel_rotation_deg: of the panel about its normal.
-            source_object_mm, source_detector_mm: where they are not the instrument's.
-            photons_per_pixel: of light whose photons were counted otherwise (EMVA 1288).
-            scene: name of a scene added before; empty: the open beam.
-            corrected: what was done to the frames (`offset`, `gain`, `defects`, `log`).
-            role: `calibration` or `evaluation`; None: either.
-            layer: `front` or `back`, of a dual-layer panel.
-            time_s: (n,) times of the frames in s, where they are known.
-
-        Returns:
-            The writer of this series.
-
-        Raises:
-            InputError: a name used twice, an unknown kind, frames of mixed shapes or values the type cannot hold.
-        """
-        _check_name("series name", name, taken=self._series)
-        if kind not in KINDS:
-            raise InputError(f"kind of series {name}", received=repr(kind), expected="one of " + ", ".join(KINDS))
-        words = tuple(corrected)
-        if not set(words) <= set(CORRECTIONS):
-            raise InputError(
-                f"corrected of series {name}", received="+".join(words), expected="any of " + ", ".join(CORRECTIONS)
-            )
-        if role is not None and role not in ROLES:
-            raise InputError(f"role of series {name}", received=repr(role), expected="one of " + ", ".join(ROLES))
-        if kind in ("flat", "object"):
-            for label, value in (("kV", kV), ("current_mA", current_mA), ("power_W", power_W)):
-                if value is not None:
-                    check_number(f"{label} of series {name}", value)
-        group = self._series.create_group(name)
-        number = self._next_index if index is None else int(index)
-        self._next_index = max(self._next_index, number + 1)
-        attributes: dict[str, Any] = {
-            "index": number,
-            "kind": kind,
-            "kV": kV,
-            "exposure_ms": exposure_ms,
-            "current_mA": current_mA,
-            "power_W": power_W,
-            "filter": None if filters is None else text_from_filters(filters),
-            "averaged": averaged,
-            "frame_interval_ms": frame_interval_ms,
-            "belt_speed_mm_s": belt_speed_mm_s,
-            "panel_rotation_deg": panel_rotation_deg,
-            "source_object_mm": source_object_mm,
-            "source_detector_mm": source_detector_mm,
-            "photons_per_pixel": photons_per_pixel,
-            "scene": scene or None,
-            "corrected": "+".join(word for word in CORRECTIONS if word in words) or None,
-            "role": role,
-            "layer": layer,
-        }
-        if setting is not None:
-            attributes = _attributes_of(setting) | {
-                key: value for key, value in attributes.items() if value is not None
-            }
-        for key, value in attributes.items():
-            if value is not None:
-                group.attrs[key] = value
-        pieces = _pieces(frames)
-        first = next(pieces, None)
-        if shape is None:
-            if first is None:
-                raise InputError(
-                    f"series {name}", received="no frames", expected="frames, or their shape to append later"
-                )
-            shape = (int(first.shape[-2]), int(first.shape[-1])) if first.ndim >= 2 else (0, 0)
-        if min(shape) < 1:
-            raise InputError(f"frames of series {name}", received=f"{_by(shape)} pixels", expected="(row, column)")
-        if dtype is None:
-            dtype = np.uint16 if first is None or first.dtype.kind in "iub" else np.float32
-        if np.dtype(dtype) not in (np.uint16, np.float32):
-            raise InputError(f"dtype of series {name}", received=str(np.dtype(dtype)), expected="uint16 or float32")
-        dataset = group.create_dataset(
-            "frames",
-            shape=(0, *shape),
-            maxshape=(None, *shape),
-            dtype=dtype,
-            chunks=(chunk_frames or _chunk_frames(shape, np.dtype(dtype), frames), *shape),
-            compression=self._compression,
-            shuffle=self._compression is not None,
-        )
-        writer = SeriesWriter(group, name=name, dataset=dataset)
-        self._writers.append(writer)
-        while first is not None:
-            writer.append(first)
-            first = next(pieces, None)
-        if time_s is not None:
-            writer._time_s = np.asarray(time_s, dtype=np.float64).tolist()
-        return writer
-
-    def add_scene(
-        self,
-        name: str,
-        *,
-        kind: str,
-        thickness_mm: Mapping[str, NDArray[Any]] | None = None,
-        foreign_object_mask: NDArray[Any] | None = None,
-        product_mask: NDArray[Any] | None = None,
-        product: str = "",
-        foreign_object: str = "",
-        size_mm: float | None = None,
-        attributes: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Add what stood in the beam: path lengths (mm) for every pixel by material, masks, identifiers.
-
-        Args:
-            name: what the series' `scene` says.
-            kind: `wedge`, `slab`, `edge`, `disc` or `product`.
-            thickness_mm: material -> (row, column) path length along the ray that ends in that pixel.
-            foreign_object_mask, product_mask: (row, column), anything but 0 is inside.
-            product, foreign_object: identifiers; empty = none or unknown.
-            size_mm: size of the foreign object; None or NaN = unknown.
-            attributes: further attributes to keep with the scene.
-        """
-        _check_name("scene name", name, taken=self._scenes)
-        if kind not in SCENE_KINDS:
-            raise InputError(f"kind of scene {name}", received=repr(kind), expected="one of " + ", ".join(SCENE_KINDS))
-        group = self._scenes.create_group(name)
-        told = {"kind": kind, "product": product or None, "foreign_object": foreign_object or None, "size_mm": size_mm}
-        for key, value in {**(attributes or {}), **told}.items():
-            if value is not None:
-                group.attrs[key] = value
-        for material, plane in (thickness_mm or {}).items():
-            _check_name(f"material of scene {name}", material, taken=())
-            lengths = np.asarray(plane, dtype=np.float32)
-            if not bool(np.all(np.isfinite(lengths) & (lengths >= 0))):
-                raise InputError(
-                    f"thickness of {material} in scene {name}",
-                    received="a negative or non-finite value",
-                    expected="finite path lengths of 0 mm or more",
-                )
-            # Maps are smooth and mostly empty: compression costs little and saves most of the space.
-            group.create_dataset(f"thickness_mm/{material}", data=lengths, compression="lzf", shuffle=True)
-        for mask_name, mask in (("foreign_object_mask", foreign_object_mask), ("product_mask", product_mask)):
-            if mask is not None:
-                data = (np.asarray(mask) != 0).astype(np.uint8)
-                group.create_dataset(mask_name, data=data, compression="lzf")
-
-    def _finish(self) -> None:
-        for writer in self._writers:
-            writer._finish()
-        if self._writers:
-            # a flat shows more than a dark does
-            shown = [name for name in self._series if self._series[name].attrs["kind"] in ("flat", "object")]
-            mark_as_entry(self._series, next(iter(shown), self._writers[0].name))
-        for group in self._scenes.values():
-            maps = list(group.get("thickness_mm", ()))
-            if maps:
-                mark_as_pictures(group["thickness_mm"], maps[0], others=maps[1:])
-            masks = [name for name in ("foreign_object_mask", "product_mask") if name in group]
-            if masks:
-                mark_as_pictures(group, masks[0], others=masks[1:])
-
-
-@contextmanager
-def write_acquisition(
-    path: str | os.PathLike[str], instrument: Instrument | None = None, *, compression: str | None = None
-) -> Iterator[AcquisitionWriter]:
-    """Write an acquisition file in a `with` block; it appears under its name when the block succeeds, or not at all.
-
-    Args:
-        path: the file to write; an existing one is replaced.
-        instrument: what is known about the line.
-        compression: None (fastest), `lzf` or `gzip`, for the frames.
-
-    Raises:
-        InputError: what was written does not make a valid file (no series, a series without frames, masks of
-            another shape, an attribute out of range).
-    """
-    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs["format"] = FORMAT
-        file.attrs["version"] = VERSION
-        file.attrs.update({"NX_class": "NXroot", "default": "series"})
-        _write_instrument(file.create_group("instrument"), instrument or Instrument())
-        writer = AcquisitionWriter(file, compression=compression)
-        yield writer
-        writer._finish()
-        # The reader's own checks, so that nothing is written that could not be read.
-        if writer._writers or not writer._left_out:
-            _acquisition(file, path=str(path))
-        writer._mark_left_out()
-
-
-def _write_instrument(group: Any, instrument: Instrument) -> None:
-    for field in fields(Instrument):
-        value = getattr(instrument, field.name)
-        if value is not None:
-            group.attrs[field.name] = text_from_filters(value) if field.name in LAYER_FIELDS else value
-
-
-def _attributes_of(setting: Setting) -> dict[str, Any]:
-    attributes = {
-        field.name: getattr(setting, field.name)
-        for field in fields(Setting)
-        if field.name not in ("filters", "averaged", "binning")
-    }
-    attributes["filter"] = text_from_filters(setting.filters)
-    if setting.averaged != 1:
-        attributes["averaged"] = int(setting.averaged)
-    if setting.binning != 1:
-        attributes["binning"] = int(setting.binning)
-    return attributes
-
-
-def _chunk_frames(shape: Sequence[int], dtype: np.dtype[Any], frames: object) -> int:
-    fitting = max(1, _CHUNK_BYTES // max(1, math.prod(shape) * dtype.itemsize))
-    return min(fitting, len(frames)) if isinstance(frames, np.ndarray) and frames.ndim == 3 else fitting
-
-
-def _pieces(frames: NDArray[Any] | Iterable[NDArray[Any]] | None) -> Iterator[NDArray[Any]]:
-    if frames is None:
-        return
-    if isinstance(frames, np.ndarray):
-        yield frames
-        return
-    for piece in frames:
-        yield np.asarray(piece)
-
-
-def _storable(block: NDArray[Any], dtype: np.dtype[Any], *, name: str) -> NDArray[Any]:
-    if block.dtype.kind not in "iufb":
-        raise InputError(
-            f"frames of series {name}", received=f"values of type {block.dtype}", expected="detector numbers"
-        )
-    if block.dtype.kind == "f" and not bool(np.isfinite(block).all()):
-        raise InputError(
-            f"frames of series {name}", received="a value that is not finite", expected="finite detector numbers"
-        )
-    if dtype == np.uint16 and block.dtype not in (np.uint16, np.uint8) and block.size:
-        lowest, highest = block.min(), block.max()
-        whole = block.dtype.kind != "f" or bool(np.all(block == np.rint(block)))
-        if lowest < 0 or highest > 65535 or not whole:
-            raise InputError(
-                f"frames of series {name}",
-                received=f"values from {lowest:g} to {highest:g}" if whole else "values that are not whole",
-                expected="whole detector numbers from 0 to 65535 in a uint16 series",
-                remedy="write the series as float32",
-            )
-    return block.astype(dtype, copy=False)
-
-
-def _check_name(argument: str, name: str, *, taken: Any) -> None:
-    if not name or "/" in name or name in (".", ".."):
-        raise InputError(argument, received=repr(name), expected="a name without '/'")
-    if name in taken:
-        raise InputError(argument, received=f"{name!r} twice", expected="a name of its own for each")

@@ -17,7 +17,8 @@ from ..errors import FileFormatError, InputError
 from ._dicom_files import dicom_header, is_dicom, iter_dicom
 from ._image_files import DICOM_ENDINGS, frame_dtype, natural_key
 from ._image_header import ImageHeader
-from .acquisition_io import AcquisitionWriter, SeriesWriter, write_acquisition
+from .acquisition_io import write_acquisition
+from .acquisition_writer import AcquisitionWriter, SeriesWriter
 from .image_header import INSTRUMENT_WORDS, SETTING_WORDS, agreement, alike
 from .import_report import ImportReport, Skipped
 from .instrument import Instrument

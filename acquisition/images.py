@@ -62,6 +62,7 @@ from typing import Any
 
 from ..errors import FileFormatError, InputError
 from ..results import counted
+from ._hdf5 import named
 from ._image_files import (
     IMAGE_ENDINGS,
     TIFF_ENDINGS,
@@ -87,7 +88,8 @@ from ._sidecar import (
     tables_of,
     text_of,
 )
-from .acquisition_io import AcquisitionWriter, SeriesWriter, named, write_acquisition
+from .acquisition_io import write_acquisition
+from .acquisition_writer import AcquisitionWriter, SeriesWriter
 from .image_header import INSTRUMENT_WORDS, SETTING_WORDS, agreement, alike, read_image_header
 from .import_report import ImportReport, Skipped
 from .instrument import Instrument

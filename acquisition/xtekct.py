@@ -14,7 +14,8 @@ from pathlib import Path
 from ..errors import FileFormatError, InputError
 from ._image_files import TIFF_ENDINGS, frame_dtype, iter_images, natural_key
 from ._image_header import metal_of, number_of_text
-from .acquisition_io import SeriesWriter, write_acquisition
+from .acquisition_io import write_acquisition
+from .acquisition_writer import SeriesWriter
 from .import_report import ImportReport, Skipped
 from .instrument import Instrument
 from .setting import Filter, text_from_filters

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from ..errors import FileFormatError, InputError
 from ..files import CSV_UTF8, read_utf8
 from ._image_files import TIFF_ENDINGS, frame_dtype, iter_images, natural_key, number_or_nan, read_image, read_mask
-from .acquisition_io import AcquisitionWriter, write_acquisition
+from .acquisition_io import write_acquisition
+from .acquisition_writer import AcquisitionWriter
 from .contrast import delta_r
 from .dataset_io import SPLITS, DatasetRow, write_dataset
 from .import_report import ImportReport, Skipped

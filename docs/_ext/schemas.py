@@ -50,7 +50,7 @@ def titled(title: str, schema: Schema) -> Schema:
 
 def sidecar() -> Schema:
     """`raytwin.toml` beside a folder of images."""
-    from raytwin.acquisition.acquisition_io import KINDS, ROLES, SCENE_KINDS
+    from raytwin.acquisition._acquisition_words import KINDS, ROLES, SCENE_KINDS
     from raytwin.acquisition.images import _NUMBERS, _SCENE_WORDS, _SERIES_WORDS, _WHOLE
     from raytwin.acquisition.instrument import BOOLEAN_FIELDS, LAYER_FIELDS, TEXT_FIELDS, WHOLE_FIELDS, Instrument
     from raytwin.acquisition.reference import _PAIR_WORDS

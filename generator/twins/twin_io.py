@@ -7,14 +7,14 @@ import json
 import math
 import os
 import sys
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..._guard import bounded
-from ...acquisition.instrument import LAYER_FIELDS, Instrument
+from ...acquisition.instrument import Instrument
 from ...acquisition.setting import filters_from_text, text_from_filters
 from ...errors import FileFormatError, InputError
 from ...files import whole_file
@@ -90,6 +90,7 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
     import h5py
 
     from ...acquisition._hdf5 import mark_as_pictures
+    from ...acquisition.instrument_io import write_instrument
 
     with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["format"] = FORMAT
@@ -97,7 +98,7 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
         file.attrs["provenance"] = json.dumps(dict(twin.provenance))
         file.attrs["evidence"] = json.dumps(dict(twin.evidence))
         file.attrs["warnings"] = json.dumps(list(twin.warnings))
-        _put_instrument(file, twin.instrument)
+        write_instrument(file.create_group("instrument"), twin.instrument)
         if isinstance(twin, TubeTwin):
             file.attrs["part"] = TUBE
             file.attrs["output_known"] = twin.output_known
@@ -164,14 +165,6 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
             group.create_dataset("flat_shape", data=level.flat_shape, compression="gzip", shuffle=True)
         if twin.spectral is not None:
             _put_spectral(file, twin.spectral)
-
-
-def _put_instrument(file: Any, instrument: Instrument) -> None:
-    group = file.create_group("instrument")
-    for entry in fields(Instrument):
-        value = getattr(instrument, entry.name)
-        if value is not None:
-            group.attrs[entry.name] = text_from_filters(value) if entry.name in LAYER_FIELDS else value
 
 
 def _put_spectral(file: Any, posterior: SpectralPosterior) -> None:
@@ -264,7 +257,7 @@ def read_any_twin(path: str | os.PathLike[str]) -> Twin | TubeTwin:
 
 
 def _instrument_from_file(file: Any, path: object) -> Instrument:
-    from ...acquisition.acquisition_io import read_instrument
+    from ...acquisition.instrument_io import read_instrument
 
     return read_instrument(file["instrument"], path=f"twin {path}")
 

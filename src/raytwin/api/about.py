@@ -219,6 +219,7 @@ def export(
         ['levels.csv', 'noise.json']
     """
     from ..acquisition import acquisition_io, dataset_io
+    from ..acquisition._acquisition_words import FORMAT as ACQUISITION_FORMAT
     from ..acquisition._hdf5 import format_of_file
 
     folder = given_path(output, expected="a folder", argument="output")
@@ -228,7 +229,7 @@ def export(
             kind = format_of_file(source)
             if kind == dataset_io.FORMAT:
                 opened = stack.enter_context(dataset_io.read_dataset(source))
-            elif kind == acquisition_io.FORMAT:
+            elif kind == ACQUISITION_FORMAT:
                 opened = stack.enter_context(acquisition_io.open_acquisition(source))
             elif kind is None and to in _NOT_OF_TWINS and not twin_path(source).exists():
                 raise FileFormatError("source", received=source, expected=f"an existing {_NOT_OF_TWINS[to]} file")

@@ -30,6 +30,7 @@ from .trials import Trials
 
 Array = NDArray[np.float64]
 
+_NAMES = ("first", "second")  # of the tables, in messages
 _MOST_ALIKE = 0.99  # correlation of two a90 that intervals take: 1 would say that the difference is known exactly
 
 
@@ -40,6 +41,9 @@ class Interval:
     value: float | None
     low: float | None
     high: float | None
+
+
+_EMPTY = Interval(value=None, low=None, high=None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,36 +133,13 @@ def compare_pod(
     Raises:
         InputError: a margin that is no share above 0 and below 1.
     """
-    check_number("margin", margin)
-    if not 0 < margin < 1:
-        raise InputError("margin", received=margin, expected="a share of a90 above 0 and below 1: 0.1 is 10 %")
-    if size_margin is not None:
-        check_number("size margin", size_margin)
-    if size_margin is not None and not (math.isfinite(size_margin) and size_margin > 0):
-        raise InputError("size margin", received=size_margin, expected="a positive size, in the unit of the tables")
-    fits = tuple(
-        fit_trials(_compressed(table), link=link, log_size=log_size, method=method, repeats=repeats)
-        for table in (first, second)
-    )
-    notes = [f"{name}: {note}" for name, fit in zip(("first", "second"), fits, strict=True) for note in fit.warnings]
-    if repeats == "crossed" and any(fit.repeats == "cluster" for fit in fits):
-        # a spread without finite estimate in one table: both are treated alike, and so is the test of the curves
-        repeats = "cluster"
-        fits = tuple(
-            fit
-            if fit.repeats == "cluster"
-            else fit_trials(_compressed(table), link=link, log_size=log_size, method=method, repeats=repeats)
-            for table, fit in zip((first, second), fits, strict=True)
-        )
+    _check_margins(margin, size_margin)
+    tables = (first, second)
+    fits, repeats, notes = _fits_alike(tables, link=link, log_size=log_size, method=method, repeats=repeats)
     if not link_named:
-        opened = [
-            with_links_open(fit, compare_models(table), named=False)
-            for fit, table in zip(fits, (first, second), strict=True)
-        ]
-        notes += [f"{name}: {told}" for name, (*_, told) in zip(("first", "second"), opened, strict=True) if told]
-        fits = tuple(fit for fit, *_ in opened)
+        fits, told = _with_links_open(fits, tables)
+        notes += told
     pairs = [word for word, given in (("image", shared_images), ("network", shared_networks)) if given]
-    paired = " and ".join(pairs) or "nothing"
     correlation, at_bound = 0.0, False
     if pairs and all(fit.curve is not None and fit.c1 is not None and fit.c1 > 0 for fit in fits):
         correlation, at_bound = _correlation(first, second, fits, log_size=log_size, shared=pairs, repeats=repeats)
@@ -168,45 +149,8 @@ def compare_pod(
         notes.append(
             "the difference spreads less than any correlation of the two a90 allows: its interval is that of a90 that share nothing"
         )
-    empty = Interval(value=None, low=None, high=None)
-    # the 90 % interval: the 95 % interval's arms shortened, which is exact for a quadratic log-likelihood
-    freedoms = [math.inf if fit.degrees_of_freedom is None else fit.degrees_of_freedom for fit in fits]
-    shares = [float(student_quantile(ONE_SIDED, m) / student_quantile(TWO_SIDED, m)) for m in freedoms]
-    difference = ratio = empty
-    low90 = high90 = p = None
-    verdict = "inconclusive"
-    a, b = fits[0].a90, fits[1].a90
-    if a is None or b is None:
-        notes.append("one of the curves has no a90: nothing to compare there")
-    else:
-        difference = _mover(b, a, *_ends(fits[1], 1.0), *_ends(fits[0], 1.0), correlation)
-        logs = _mover(
-            math.log(b) if b > 0 else math.nan,
-            math.log(a) if a > 0 else math.nan,
-            *_log_ends(fits[1], 1.0),
-            *_log_ends(fits[0], 1.0),
-            correlation,
-        )
-        if a <= 0 or b <= 0:
-            notes.append("sizes are not all above 0 (a log scale?): no ratio and no equivalence test")
-            ratio = empty
-        else:
-            ratio = Interval(
-                value=b / a,
-                low=None if logs.low is None else math.exp(logs.low),
-                high=None if logs.high is None else math.exp(logs.high),
-            )
-            short = _mover(
-                math.log(b), math.log(a), *_log_ends(fits[1], shares[1]), *_log_ends(fits[0], shares[0]), correlation
-            )
-            low90 = None if short.low is None else math.exp(short.low)
-            high90 = None if short.high is None else math.exp(short.high)
-            edge = math.log1p(margin)
-            middle = math.log(b / a)
-            p = _p_equivalence(middle, logs, edge, min(freedoms))
-            inside = low90 is not None and high90 is not None and low90 > math.exp(-edge) and high90 < math.exp(edge)
-            apart = (ratio.low is not None and ratio.low > 1) or (ratio.high is not None and ratio.high < 1)
-            verdict = _verdict(inside=inside, apart=apart)
+    sizes = _compare_a90(fits, margin=margin, correlation=correlation)
+    notes += sizes.notes
     test = None
     if all(fit.curve is not None and not fit.separated for fit in fits):
         test = _curve_test(first, second, link=link, log_size=log_size, repeats=repeats, fits=fits, shared=pairs)
@@ -220,31 +164,125 @@ def compare_pod(
     return Comparison(
         first=fits[0],
         second=fits[1],
-        difference_a90=difference,
-        ratio_a90=ratio,
+        difference_a90=sizes.difference,
+        ratio_a90=sizes.ratio,
         margin=margin,
-        equivalence_low=low90,
-        equivalence_high=high90,
-        p_equivalence=p,
-        verdict=verdict,
+        equivalence_low=sizes.low90,
+        equivalence_high=sizes.high90,
+        p_equivalence=sizes.p,
+        verdict=sizes.verdict,
         correlation=correlation,
-        paired=paired,
+        paired=" and ".join(pairs) or "nothing",
         curve_test=test,
         warnings=tuple(notes),
         correlation_at_bound=at_bound,
         size_equivalence=None
         if size_margin is None
-        else _size_equivalence(fits, difference, shares, margin=size_margin, correlation=correlation),
+        else _size_equivalence(fits, sizes.difference, margin=size_margin, correlation=correlation),
     )
 
 
+def _check_margins(margin: float, size_margin: float | None) -> None:
+    check_number("margin", margin)
+    if not 0 < margin < 1:
+        raise InputError("margin", received=margin, expected="a share of a90 above 0 and below 1: 0.1 is 10 %")
+    if size_margin is not None:
+        check_number("size margin", size_margin)
+    if size_margin is not None and not (math.isfinite(size_margin) and size_margin > 0):
+        raise InputError("size margin", received=size_margin, expected="a positive size, in the unit of the tables")
+
+
+def _fits_alike(
+    tables: tuple[Trials, Trials], *, link: str, log_size: bool, method: str, repeats: str
+) -> tuple[tuple[PodFit, ...], str, list[str]]:
+    """Both curves, the treatment of repeats that both have, and what was said of each."""
+
+    def fit_of(table: Trials, repeats: str) -> PodFit:
+        return fit_trials(_compressed(table), link=link, log_size=log_size, method=method, repeats=repeats)
+
+    fits = tuple(fit_of(table, repeats) for table in tables)
+    notes = [f"{name}: {note}" for name, fit in zip(_NAMES, fits, strict=True) for note in fit.warnings]
+    if repeats == "crossed" and any(fit.repeats == "cluster" for fit in fits):
+        # a spread without finite estimate in one table: both are treated alike, and so is the test of the curves
+        repeats = "cluster"
+        fits = tuple(
+            fit if fit.repeats == "cluster" else fit_of(table, repeats) for table, fit in zip(tables, fits, strict=True)
+        )
+    return fits, repeats, notes
+
+
+def _with_links_open(fits: tuple[PodFit, ...], tables: tuple[Trials, Trials]) -> tuple[tuple[PodFit, ...], list[str]]:
+    """Both fits with the bounds of all curves that fit their table, where another link fits better; and what to say of it."""
+    opened = [with_links_open(fit, compare_models(table), named=False) for fit, table in zip(fits, tables, strict=True)]
+    notes = [f"{name}: {told}" for name, (*_, told) in zip(_NAMES, opened, strict=True) if told]
+    return tuple(fit for fit, *_ in opened), notes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _ComparedSizes:
+    """Difference and ratio of two a90, the 90 % interval of the ratio, the larger one-sided p, the verdict."""
+
+    difference: Interval = _EMPTY
+    ratio: Interval = _EMPTY
+    low90: float | None = None
+    high90: float | None = None
+    p: float | None = None
+    verdict: str = "inconclusive"
+    notes: tuple[str, ...] = ()
+
+
+def _compare_a90(fits: tuple[PodFit, ...], *, margin: float, correlation: float) -> _ComparedSizes:
+    """The two a90 compared; `margin` is on their ratio."""
+    a, b = fits[0].a90, fits[1].a90
+    if a is None or b is None:
+        return _ComparedSizes(notes=("one of the curves has no a90: nothing to compare there",))
+    difference = _mover(b, a, *_ends(fits[1], 1.0), *_ends(fits[0], 1.0), correlation)
+    if a <= 0 or b <= 0:
+        told = "sizes are not all above 0 (a log scale?): no ratio and no equivalence test"
+        return _ComparedSizes(difference=difference, notes=(told,))
+    middle = math.log(b / a)
+    logs = _mover(math.log(b), math.log(a), *_log_ends(fits[1], 1.0), *_log_ends(fits[0], 1.0), correlation)
+    ratio = Interval(value=b / a, low=_exp(logs.low), high=_exp(logs.high))
+    shares = _arms_of_90(fits)
+    short = _mover(
+        math.log(b), math.log(a), *_log_ends(fits[1], shares[1]), *_log_ends(fits[0], shares[0]), correlation
+    )
+    low90, high90 = _exp(short.low), _exp(short.high)
+    edge = math.log1p(margin)
+    inside = low90 is not None and high90 is not None and low90 > math.exp(-edge) and high90 < math.exp(edge)
+    apart = (ratio.low is not None and ratio.low > 1) or (ratio.high is not None and ratio.high < 1)
+    return _ComparedSizes(
+        difference=difference,
+        ratio=ratio,
+        low90=low90,
+        high90=high90,
+        p=_p_equivalence(middle, logs, edge, min(_freedoms(fits))),
+        verdict=_verdict(inside=inside, apart=apart),
+    )
+
+
+def _exp(log: float | None) -> float | None:
+    return None if log is None else math.exp(log)
+
+
+def _freedoms(fits: tuple[PodFit, ...]) -> list[float]:
+    """Degrees of freedom of each fit, infinite where it has many."""
+    return [math.inf if fit.degrees_of_freedom is None else fit.degrees_of_freedom for fit in fits]
+
+
+def _arms_of_90(fits: tuple[PodFit, ...]) -> list[float]:
+    """By how much the arms of each 95 % interval shorten to 90 %, which is exact for a quadratic log-likelihood."""
+    return [float(student_quantile(ONE_SIDED, m) / student_quantile(TWO_SIDED, m)) for m in _freedoms(fits)]
+
+
 def _size_equivalence(
-    fits: tuple[PodFit, ...], difference: Interval, shares: list[float], *, margin: float, correlation: float
+    fits: tuple[PodFit, ...], difference: Interval, *, margin: float, correlation: float
 ) -> SizeEquivalence:
-    """Verdict on the difference of the two a90; `shares` shorten the arms of their 95 % intervals to 90 %."""
+    """Verdict on the difference of the two a90."""
     a, b = fits[0].a90, fits[1].a90
     if a is None or b is None:
         return SizeEquivalence(margin=margin, low=None, high=None, verdict="inconclusive")
+    shares = _arms_of_90(fits)
     short = _mover(b, a, *_ends(fits[1], shares[1]), *_ends(fits[0], shares[0]), correlation)
     inside = short.low is not None and short.high is not None and short.low > -margin and short.high < margin
     apart = (difference.low is not None and difference.low > 0) or (difference.high is not None and difference.high < 0)

@@ -11,7 +11,7 @@ import io
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +42,10 @@ _HIT_WORDS = {
     "no": 0.0,
     "yes": 1.0,
 }
+
+
+# columns of a table whose inspections stood side by side
+_MELTED_ROW, _MELTED_INSPECTION, _MELTED_HIT = "raytwin_row", "raytwin_inspection", "raytwin_hit"
 
 
 class HitError(InputError):
@@ -116,111 +120,130 @@ def read_pod_table(
         FileFormatError: no such file, not text, no header, a row with another number of columns.
         InputError: a column is missing or holds something that cannot be used; the message gives the line.
     """
-    header, rows, lines = _rows_of(source)
+    sheet = _sheet_of(source)
     if where:
-        rows, lines = _filtered(header, rows, lines, where)
+        sheet = _filtered(sheet, where)
     notes: list[str] = []
-    size_name = _chosen(size, header, "size") if size else _default(header, SIZE_NAMES, "size")
-    at_size = header.index(size_name)
-    named: dict[str, str | None] = {}
-    for role, name, usual in (
-        ("network", network, ("network",)),
-        ("image", image, ("image",)),
-        ("site", site, SITE_NAMES),
-    ):
-        named[role] = _chosen(name, header, role) if name else _present(header, usual)
-    trials_name = _chosen(trials, header, "trials") if trials else None
-    response_name = _chosen(response, header, "response") if response else None
-    hit_names: list[str] = []
+    size_name = _chosen(size, sheet.header, "size") if size else _default(sheet.header, SIZE_NAMES, "size")
+    labels = {
+        "network": _label_column("network", network, sheet.header, ("network",)),
+        "image": _label_column("image", image, sheet.header, ("image",)),
+        "site": _label_column("site", site, sheet.header, SITE_NAMES),
+    }
+    trials_name = _chosen(trials, sheet.header, "trials") if trials else None
+    response_name = _chosen(response, sheet.header, "response") if response else None
+    hit_name = None
     if response_name is None:
-        hit_names = _hit_columns(hit, header, rows, at_size, [n for n in (*named.values(), trials_name) if n])
+        taken = [name for name in (*labels.values(), trials_name) if name]
+        hit_names = _hit_columns(hit, sheet, sheet.header.index(size_name), taken)
+        hit_name = hit_names[0] if hit_names else None
         if len(hit_names) > 1:
             if trials_name:
                 raise InputError(
                     "trials", received=f"with {len(hit_names)} columns of hits", expected="one column of hits"
                 )
-            rows, lines, header = _melted(header, rows, lines, hit_names)
-            if named["image"] is None:
-                named["image"] = named["site"] or "raytwin_row"
-            named["network"] = "raytwin_inspection"
+            sheet = _melted(sheet, hit_names)
+            hit_name = _MELTED_HIT
+            labels["image"] = labels["image"] or labels["site"] or _MELTED_ROW
+            labels["network"] = _MELTED_INSPECTION
             notes.append(f"columns {', '.join(hit_names)} read as {len(hit_names)} inspections of each row")
-            hit_names = ["raytwin_hit"]
-            at_size = header.index(size_name)
-    alarm_name = _present(header, ("false_alarm",))
-    with_object, without, unknown = [], [], 0
-    object_name = _present(header, ("foreign_object",))
-    for number, row in enumerate(rows):
-        if row[at_size].strip():
-            with_object.append(number)
-        elif object_name and row[header.index(object_name)].strip():
-            unknown += 1
-        else:
-            without.append(number)
-    if unknown:
-        notes.append(f"left out: {counted(unknown, 'row')} with a foreign object but no {size_name}")
-    if not with_object:
-        raise InputError(size_name, received="no row with a size", expected="sizes of foreign objects in this column")
-
-    def column(name: str, chosen: list[int]) -> tuple[str, ...]:
-        at = header.index(name)
-        return tuple(rows[number][at].strip() for number in chosen)
-
-    def numbers(name: str, chosen: list[int]) -> Array:
-        texts = column(name, chosen)
-        return np.array([_number(t, name, f"line {lines[i]}") for t, i in zip(texts, chosen, strict=True)])
-
-    sizes = numbers(size_name, with_object)
+    with_object, without = _rows_with_and_without(sheet, size_name, notes)
+    sizes = sheet.numbers(size_name, with_object)
     zeros = int((sizes == 0).sum())
     if 1 < zeros < len(sizes) and not trials_name and np.all(sizes >= 0):
         notes.append(
             f"{zeros} rows of {size_name} 0 taken as foreign objects of that size; a product without one has an empty {size_name}"
         )
     hits = None
-    if hit_names:
-        if trials_name:
-            hits = numbers(hit_names[0], with_object)
-        else:
-            texts = column(hit_names[0], with_object)
-            shown = hit_names[0].replace("raytwin_hit", "hit")
-            hits = np.array([_hit(t, shown, f"line {lines[i]}") for t, i in zip(texts, with_object, strict=True)])
-    alarms = np.zeros(0)
-    if without:
-        source = alarm_name or (hit_names[0] if hit_names else None)
-        if source is not None:
-            texts = column(source, without)
-            alarms = np.array(
-                [_hit(t, source, f"line {lines[i]}") for t, i in zip(texts, without, strict=True) if t != ""]
-            )
-            if len(alarms) < len(without):
-                notes.append(
-                    f"no word of a false alarm in {counted(len(without) - len(alarms), 'row')} without foreign object"
-                )
-                without = [i for t, i in zip(texts, without, strict=True) if t != ""]
+    if hit_name is not None:
+        read = sheet.numbers if trials_name else sheet.hits
+        hits = read(hit_name, with_object)
+    alarms, without = _false_alarms(sheet, _present(sheet.header, ("false_alarm",)) or hit_name, without, notes)
     noise = np.zeros(0)
     if response_name and without:
-        told = [i for i in without if rows[i][header.index(response_name)].strip()]
-        noise = numbers(response_name, told)
-    own = {size_name, *hit_names, *(n for n in (trials_name, response_name) if n)}
+        noise = sheet.numbers(response_name, sheet.filled(response_name, without))
+    own = {size_name, *(name for name in (hit_name, trials_name, response_name) if name)}
     return PodTable(
         size_name=size_name,
         size=sizes,
         hits=hits,
-        trials=numbers(trials_name, with_object) if trials_name else None,
-        response=numbers(response_name, with_object) if response_name else None,
-        **{role: column(name, with_object) if name else None for role, name in named.items()},
-        other={name: column(name, with_object) for name in header if name not in own},
+        trials=sheet.numbers(trials_name, with_object) if trials_name else None,
+        response=sheet.numbers(response_name, with_object) if response_name else None,
+        **{role: sheet.texts(name, with_object) if name else None for role, name in labels.items()},
+        other={name: sheet.texts(name, with_object) for name in sheet.header if name not in own},
         false_alarm=alarms,
-        false_alarm_network=column(named["network"], without) if named["network"] and len(alarms) else None,
-        false_alarm_image=column(named["image"], without) if named["image"] and len(alarms) else None,
+        false_alarm_network=sheet.texts(labels["network"], without) if labels["network"] and len(alarms) else None,
+        false_alarm_image=sheet.texts(labels["image"], without) if labels["image"] and len(alarms) else None,
         noise_response=noise,
         notes=tuple(notes),
     )
 
 
-def _rows_of(source: Any) -> tuple[list[str], list[list[str]], list[int]]:
-    """Header, rows as texts and their numbers, of a file or of columns in memory."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Sheet:
+    """A table as it stands in a file: names of columns, rows of texts, and the number of the line of each row."""
+
+    header: list[str]
+    rows: list[list[str]]
+    lines: list[int]
+
+    def texts(self, name: str, chosen: Sequence[int]) -> tuple[str, ...]:
+        """A column of the rows chosen."""
+        at = self.header.index(name)
+        return tuple(self.rows[number][at].strip() for number in chosen)
+
+    def numbers(self, name: str, chosen: Sequence[int]) -> Array:
+        """A column of the rows chosen as finite numbers."""
+        return np.array([_number(text, name, place) for text, place in self._told(name, chosen)])
+
+    def hits(self, name: str, chosen: Sequence[int]) -> Array:
+        """A column of the rows chosen as 0 and 1."""
+        shown = name.replace(_MELTED_HIT, "hit")
+        return np.array([_hit(text, shown, place) for text, place in self._told(name, chosen)])
+
+    def filled(self, name: str, chosen: Sequence[int]) -> list[int]:
+        """Those of the rows chosen where a column is not empty."""
+        return [number for number, text in zip(chosen, self.texts(name, chosen), strict=True) if text != ""]
+
+    def _told(self, name: str, chosen: Sequence[int]) -> list[tuple[str, str]]:
+        return [
+            (text, f"line {self.lines[number]}") for number, text in zip(chosen, self.texts(name, chosen), strict=True)
+        ]
+
+
+def _label_column(role: str, name: str | None, header: list[str], usual: Sequence[str]) -> str | None:
+    """The column that was named for a role, else the usual one, if there is one."""
+    return _chosen(name, header, role) if name else _present(header, usual)
+
+
+def _rows_with_and_without(sheet: _Sheet, size_name: str, notes: list[str]) -> tuple[list[int], list[int]]:
+    """Rows with a foreign object of known size, and rows of products without one."""
+    with_size = set(sheet.filled(size_name, range(len(sheet.rows))))
+    object_name = _present(sheet.header, ("foreign_object",))
+    without_size = [number for number in range(len(sheet.rows)) if number not in with_size]
+    unknown = set(sheet.filled(object_name, without_size)) if object_name else set()
+    if unknown:
+        notes.append(f"left out: {counted(len(unknown), 'row')} with a foreign object but no {size_name}")
+    if not with_size:
+        raise InputError(size_name, received="no row with a size", expected="sizes of foreign objects in this column")
+    return sorted(with_size), [number for number in without_size if number not in unknown]
+
+
+def _false_alarms(sheet: _Sheet, name: str | None, without: list[int], notes: list[str]) -> tuple[Array, list[int]]:
+    """False alarms (0 or 1) of the products without foreign object, and those of these rows that tell of one."""
+    if name is None or not without:
+        return np.zeros(0), without
+    told = sheet.filled(name, without)
+    alarms = sheet.hits(name, told)
+    if len(told) < len(without):
+        notes.append(f"no word of a false alarm in {counted(len(without) - len(told), 'row')} without foreign object")
+    return alarms, told
+
+
+def _sheet_of(source: Any) -> _Sheet:
+    """The sheet of a file, or of columns in memory."""
     if isinstance(source, str | os.PathLike):
-        return _read_rows(Path(source))
+        return _read_sheet(Path(source))
     if not (isinstance(source, Mapping) or hasattr(source, "columns")):
         raise InputError(
             "table", received=type(source).__name__, expected="a path, a data frame or a mapping of columns"
@@ -238,7 +261,8 @@ def _rows_of(source: Any) -> tuple[list[str], list[list[str]], list[int]]:
     header = [str(name).strip() for name in names]
     if len(set(header)) != len(header) or "" in header:
         raise InputError("table", received=", ".join(header), expected="distinct, non-empty column names")
-    return header, [list(row) for row in zip(*columns, strict=True)], list(range(1, len(columns[0]) + 1))
+    rows = [list(row) for row in zip(*columns, strict=True)]
+    return _Sheet(header=header, rows=rows, lines=list(range(1, len(rows) + 1)))
 
 
 def _cell_text(value: Any) -> str:
@@ -246,7 +270,7 @@ def _cell_text(value: Any) -> str:
     return "" if value is None or str(value) in _MISSING else str(value)
 
 
-def _read_rows(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
+def _read_sheet(path: Path) -> _Sheet:
     try:
         text = read_utf8(path, argument=f"table {path}", save_as=CSV_UTF8)
     except FileNotFoundError:
@@ -294,7 +318,8 @@ def _read_rows(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
     body = cells[1:]
     if separator != ",":
         body = with_decimal_points(header, body, lines=numbers, argument=f"table {path}")
-    return header, [["" if cell.strip() in _MISSING else cell for cell in row] for row in body], numbers
+    rows = [["" if cell.strip() in _MISSING else cell for cell in row] for row in body]
+    return _Sheet(header=header, rows=rows, lines=numbers)
 
 
 def _is_number(text: str) -> bool:
@@ -305,19 +330,18 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _filtered(
-    header: list[str], rows: list[list[str]], lines: list[int], where: Mapping[str, str]
-) -> tuple[list[list[str]], list[int]]:
+def _filtered(sheet: _Sheet, where: Mapping[str, str]) -> _Sheet:
     if not isinstance(where, Mapping):
         raise InputError("where", received=repr(where), expected="column -> value, for example {'setting': '20ms'}")
+    rows = sheet.rows
     kept = list(range(len(rows)))
     for name, wanted in where.items():
-        at, value = header.index(_chosen(name, header, "where")), str(wanted).strip()
+        at, value = sheet.header.index(_chosen(name, sheet.header, "where")), str(wanted).strip()
         known = sorted({rows[i][at].strip() for i in kept})
         kept = [i for i in kept if rows[i][at].strip() == value]
         if not kept:
             raise InputError("where", received=f"{name}={value}", expected=f"one of {', '.join(known[:12])}")
-    return [rows[i] for i in kept], [lines[i] for i in kept]
+    return replace(sheet, rows=[rows[i] for i in kept], lines=[sheet.lines[i] for i in kept])
 
 
 def _chosen(name: str, header: list[str], option: str) -> str:
@@ -355,9 +379,9 @@ def _default(header: list[str], names: Sequence[str], option: str) -> str:
     return found
 
 
-def _hit_columns(
-    hit: str | Sequence[str] | None, header: list[str], rows: list[list[str]], at_size: int, taken: list[str]
-) -> list[str]:
+def _hit_columns(hit: str | Sequence[str] | None, sheet: _Sheet, at_size: int, taken: list[str]) -> list[str]:
+    """The columns of hits, one or more; those already taken for something else are none."""
+    header = sheet.header
     if hit is not None:
         asked = [hit] if isinstance(hit, str) else list(hit)
         names = [part.strip() for name in asked for part in (name.split(",") if name not in header else [name])]
@@ -368,27 +392,27 @@ def _hit_columns(
     binary = [
         name
         for at, name in enumerate(header)
-        if at > at_size and name not in taken and all(row[at].strip() in ("0", "1") for row in rows)
+        if at > at_size and name not in taken and all(row[at].strip() in ("0", "1") for row in sheet.rows)
     ]
     if not binary:
         return [_default(header, HIT_NAMES, "hit")]
     return binary
 
 
-def _melted(
-    header: list[str], rows: list[list[str]], lines: list[int], hits: list[str]
-) -> tuple[list[list[str]], list[int], list[str]]:
-    keep = [at for at, name in enumerate(header) if name not in hits]
-    place = [(name, header.index(name)) for name in hits]
+def _melted(sheet: _Sheet, hits: list[str]) -> _Sheet:
+    """A row for each inspection, of a sheet with a column of hits for each."""
+    keep = [at for at, name in enumerate(sheet.header) if name not in hits]
+    place = [(name, sheet.header.index(name)) for name in hits]
     melted: list[list[str]] = []
     numbers: list[int] = []
-    for order, (row, line) in enumerate(zip(rows, lines, strict=True)):
+    for order, (row, line) in enumerate(zip(sheet.rows, sheet.lines, strict=True)):
         for name, at in place:
             if row[at].strip() == "":
                 continue  # this inspector did not look at this site
             melted.append([*(row[k] for k in keep), str(order), name, row[at]])
             numbers.append(line)
-    return melted, numbers, [*(header[k] for k in keep), "raytwin_row", "raytwin_inspection", "raytwin_hit"]
+    header = [*(sheet.header[k] for k in keep), _MELTED_ROW, _MELTED_INSPECTION, _MELTED_HIT]
+    return _Sheet(header=header, rows=melted, lines=numbers)
 
 
 def _number(text: str, name: str, place: str) -> float:

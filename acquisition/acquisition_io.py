@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import MappingProxyType, TracebackType
@@ -417,36 +417,11 @@ _SERIES_WORDS = {
 def _series(group: Any, name: str, *, path: str) -> Series:
     where = f"{path}, series {name}"
     node = child(group, name)
-    frames = child(node, "frames") if isinstance(node, h5py.Group) else None
-    if not isinstance(frames, h5py.Dataset):
-        if isinstance(node, h5py.Group) and ERROR in node.attrs:
-            argument, received, expected, remedy = (str(text) for text in node.attrs[ERROR])
-            raise FileFormatError(f"{where}, {argument}", received=received, expected=expected, remedy=remedy)
-        raise FileFormatError(where, received="no dataset `frames`", expected="frames (n, row, column)")
-    if frames.ndim != 3 or 0 in frames.shape:
-        raise FileFormatError(
-            f"{where}/frames",
-            received=f"shape ({text_from_shape(frames.shape)})",
-            expected="at least one frame, (n, row, column)",
-        )
-    if frames.dtype.kind not in "iuf":
-        raise FileFormatError(
-            f"{where}/frames", received=f"values of type {frames.dtype}", expected="uint16 or float32 detector numbers"
-        )
-    check_stored(frames, where=f"{where}/frames")
-    for word in node.attrs:
-        meant = _SERIES_WORDS.get(str(word).lower())
-        if meant not in (None, word):
-            raise FileFormatError(
-                f"{where}, attribute {word}", received=repr(word), expected=f"{meant}, written like that"
-            )
-    kind = text_attribute(node, "kind", where=where)
-    if kind not in KINDS:
-        raise FileFormatError(
-            f"{where}, attribute kind",
-            received=repr(kind) if kind else "nothing",
-            expected="one of " + ", ".join(KINDS),
-        )
+    frames = _frames(node, where=where)
+    _check_spelling(node, where=where)
+    kind = _one_of(node, "kind", KINDS, where=where)
+    if kind is None:
+        raise FileFormatError(f"{where}, attribute kind", received="nothing", expected="one of " + ", ".join(KINDS))
     dark = kind in ("dark", "afterglow")
 
     def positive(attribute: str, unit: str) -> float | None:
@@ -477,21 +452,9 @@ def _series(group: Any, name: str, *, path: str) -> Series:
                 source_detector_mm=source_detector_mm,
                 binning=whole_attribute(node, "binning", where=where, lowest=1) or 1,
             )
-    corrected = frozenset(word for word in (text_attribute(node, "corrected", where=where) or "").split("+") if word)
-    if not corrected <= set(CORRECTIONS):
-        raise FileFormatError(
-            f"{where}, attribute corrected",
-            received="+".join(sorted(corrected)),
-            expected="any of " + ", ".join(CORRECTIONS) + ", joined by +",
-        )
-    role = text_attribute(node, "role", where=where) or None
-    if role is not None and role not in ROLES:
-        raise FileFormatError(f"{where}, attribute role", received=repr(role), expected="one of " + ", ".join(ROLES))
-    layer = text_attribute(node, "layer", where=where) or None
-    if layer is not None and layer not in PANEL_LAYERS:
-        raise FileFormatError(
-            f"{where}, attribute layer", received=repr(layer), expected="one of " + ", ".join(PANEL_LAYERS)
-        )
+    corrected = _corrections(node, where=where)
+    role = _one_of(node, "role", ROLES, where=where)
+    layer = _one_of(node, "layer", PANEL_LAYERS, where=where)
     index = whole_attribute(node, "index", where=where, lowest=0)
     return Series(
         name=name,
@@ -520,6 +483,60 @@ def _series(group: Any, name: str, *, path: str) -> Series:
         _where=where,
         layer=layer,
     )
+
+
+def _frames(node: Any, *, where: str) -> Any:
+    """The dataset of a series' frames, complete; the error of a series that an importer left out is raised again."""
+    frames = child(node, "frames") if isinstance(node, h5py.Group) else None
+    if not isinstance(frames, h5py.Dataset):
+        if isinstance(node, h5py.Group) and ERROR in node.attrs:
+            argument, received, expected, remedy = (str(text) for text in node.attrs[ERROR])
+            raise FileFormatError(f"{where}, {argument}", received=received, expected=expected, remedy=remedy)
+        raise FileFormatError(where, received="no dataset `frames`", expected="frames (n, row, column)")
+    if frames.ndim != 3 or 0 in frames.shape:
+        raise FileFormatError(
+            f"{where}/frames",
+            received=f"shape ({text_from_shape(frames.shape)})",
+            expected="at least one frame, (n, row, column)",
+        )
+    if frames.dtype.kind not in "iuf":
+        raise FileFormatError(
+            f"{where}/frames", received=f"values of type {frames.dtype}", expected="uint16 or float32 detector numbers"
+        )
+    check_stored(frames, where=f"{where}/frames")
+    return frames
+
+
+def _check_spelling(node: Any, *, where: str) -> None:
+    """Refuse a known attribute in other capitals: it would be passed over without a word."""
+    for word in node.attrs:
+        meant = _SERIES_WORDS.get(str(word).lower())
+        if meant not in (None, word):
+            raise FileFormatError(
+                f"{where}, attribute {word}", received=repr(word), expected=f"{meant}, written like that"
+            )
+
+
+def _one_of(node: Any, attribute: str, known: Sequence[str], *, where: str) -> str | None:
+    """A text attribute that is one of those known; None where it is absent or empty."""
+    text = text_attribute(node, attribute, where=where) or None
+    if text is not None and text not in known:
+        raise FileFormatError(
+            f"{where}, attribute {attribute}", received=repr(text), expected="one of " + ", ".join(known)
+        )
+    return text
+
+
+def _corrections(node: Any, *, where: str) -> frozenset[str]:
+    """What was done to the frames of a series."""
+    corrected = frozenset(word for word in (text_attribute(node, "corrected", where=where) or "").split("+") if word)
+    if not corrected <= set(CORRECTIONS):
+        raise FileFormatError(
+            f"{where}, attribute corrected",
+            received="+".join(sorted(corrected)),
+            expected="any of " + ", ".join(CORRECTIONS) + ", joined by +",
+        )
+    return corrected
 
 
 def _times(node: Any, *, n_frames: int, where: str) -> NDArray[np.float64] | None:

@@ -152,15 +152,8 @@ class AcquisitionWriter:
             InputError: a name used twice, an unknown kind, frames of mixed shapes or values the type cannot hold.
         """
         _check_name("series name", name, taken=self._series)
-        if kind not in KINDS:
-            raise InputError(f"kind of series {name}", received=repr(kind), expected="one of " + ", ".join(KINDS))
         words = tuple(corrected)
-        if not set(words) <= set(CORRECTIONS):
-            raise InputError(
-                f"corrected of series {name}", received="+".join(words), expected="any of " + ", ".join(CORRECTIONS)
-            )
-        if role is not None and role not in ROLES:
-            raise InputError(f"role of series {name}", received=repr(role), expected="one of " + ", ".join(ROLES))
+        _check_words(name, kind=kind, corrected=words, role=role)
         if kind in ("flat", "object"):
             for label, value in (("kV", kV), ("current_mA", current_mA), ("power_W", power_W)):
                 if value is not None:
@@ -168,7 +161,7 @@ class AcquisitionWriter:
         group = self._series.create_group(name)
         number = self._next_index if index is None else int(index)
         self._next_index = max(self._next_index, number + 1)
-        attributes: dict[str, Any] = {
+        stated: dict[str, Any] = {
             "index": number,
             "kind": kind,
             "kV": kV,
@@ -188,29 +181,13 @@ class AcquisitionWriter:
             "role": role,
             "layer": layer,
         }
-        if setting is not None:
-            attributes = _attributes_of(setting) | {
-                key: value for key, value in attributes.items() if value is not None
-            }
-        for key, value in attributes.items():
+        given = {key: value for key, value in stated.items() if value is not None}
+        for key, value in (given if setting is None else _attributes_of(setting) | given).items():
             if value is not None:
                 group.attrs[key] = value
         pieces = _pieces(frames)
         first = next(pieces, None)
-        if shape is None:
-            if first is None:
-                raise InputError(
-                    f"series {name}", received="no frames", expected="frames, or their shape to append later"
-                )
-            shape = (int(first.shape[-2]), int(first.shape[-1])) if first.ndim >= 2 else (0, 0)
-        if min(shape) < 1:
-            raise InputError(
-                f"frames of series {name}", received=f"{text_from_shape(shape)} pixels", expected="(row, column)"
-            )
-        if dtype is None:
-            dtype = np.uint16 if first is None or first.dtype.kind in "iub" else np.float32
-        if np.dtype(dtype) not in (np.uint16, np.float32):
-            raise InputError(f"dtype of series {name}", received=str(np.dtype(dtype)), expected="uint16 or float32")
+        shape, dtype = _layout(name, first, shape=shape, dtype=dtype)
         dataset = group.create_dataset(
             "frames",
             shape=(0, *shape),
@@ -315,6 +292,37 @@ def written_acquisition(
     if writer._writers or not writer._left_out:
         check()
     writer._mark_left_out()
+
+
+def _check_words(name: str, *, kind: str, corrected: tuple[str, ...], role: str | None) -> None:
+    """Refuse a kind, correction or role that readers do not know."""
+    if kind not in KINDS:
+        raise InputError(f"kind of series {name}", received=repr(kind), expected="one of " + ", ".join(KINDS))
+    if not set(corrected) <= set(CORRECTIONS):
+        raise InputError(
+            f"corrected of series {name}", received="+".join(corrected), expected="any of " + ", ".join(CORRECTIONS)
+        )
+    if role is not None and role not in ROLES:
+        raise InputError(f"role of series {name}", received=repr(role), expected="one of " + ", ".join(ROLES))
+
+
+def _layout(
+    name: str, first: NDArray[Any] | None, *, shape: tuple[int, int] | None, dtype: Any
+) -> tuple[tuple[int, int], Any]:
+    """Shape (row, column) and type of a series' frames: those stated, else those of the first frames."""
+    if shape is None:
+        if first is None:
+            raise InputError(f"series {name}", received="no frames", expected="frames, or their shape to append later")
+        shape = (int(first.shape[-2]), int(first.shape[-1])) if first.ndim >= 2 else (0, 0)
+    if min(shape) < 1:
+        raise InputError(
+            f"frames of series {name}", received=f"{text_from_shape(shape)} pixels", expected="(row, column)"
+        )
+    if dtype is None:
+        dtype = np.uint16 if first is None or first.dtype.kind in "iub" else np.float32
+    if np.dtype(dtype) not in (np.uint16, np.float32):
+        raise InputError(f"dtype of series {name}", received=str(np.dtype(dtype)), expected="uint16 or float32")
+    return shape, dtype
 
 
 def _attributes_of(setting: Setting) -> dict[str, Any]:

@@ -78,21 +78,7 @@ def calibrate_twin(
     doses = dose_data(output_table, transmission_table)
     if any(level.kV is not None for level in transfer.levels) or doses.any:
         tell("spectrum")
-        if not any(level.rate_DN_per_mAs for level in transfer.levels if level.kV is not None):
-            warnings.append("no tube current or power in the flats: levels cannot be predicted, only gains")
-        if acquisition.instrument.pixel_mm is None or acquisition.instrument.source_detector_mm is None:
-            warnings.append(
-                "pixel pitch or source-detector distance unknown: the flux scale is not absolute (1 mm and 1 m assumed)"
-            )
-        voltages = {level.kV for level in transfer.levels if level.kV is not None}
-        beams = {(level.kV, level.filters) for level in transfer.levels if level.kV is not None}
-        if len(beams) == 1 and not doses.any:
-            warnings.append(
-                "flats at one kV and filter only: filtration, scintillator and kV are hardly known; add a second kV or"
-                " the same kV with a known filter"
-            )
-        elif len(voltages) == 1 and not doses.any:
-            warnings.append("flats at one kV only: other tube voltages rest on the spectrum model; add a second kV")
+        warnings += _notes_on_beams(acquisition, transfer, dosimeter=doses.any)
         wedges = measure_transmissions(acquisition, transfer.maps)
         evidence["wedges"] = wedge_evidence(wedges)
         warnings += [f"wedge left out: {item.skipped}" for item in wedges if item.skipped]
@@ -130,21 +116,9 @@ def calibrate_twin(
             warnings.append(f"no spectral part: {error}")
         else:
             spectral = fit.posterior
-            if spectral.correction is not None:
-                voltages_kV = ", ".join(f"{kV:g}" for kV in spectral.correction.kV)
-                warnings.append(
-                    f"spectra were measured at {voltages_kV} kV; at other voltages the tube model is corrected as between or"
-                    " nearest to these"
-                )
             evidence["spectrum"] = fit_evidence(fit)
             evidence |= table_evidence(spectral, doses, output=output_table, transmission=transmission_table)
-            warnings += unlike_output(fit)
-            if contradicts(fit):
-                warnings.append(
-                    f"levels and gains do not fit the spectral model (chi-square {fit.chi_square:.0f} for {fit.data}"
-                    " data), and intervals are widened for it: check kV, filter and power of the series (`raytwin check` looks for"
-                    " wrong labels)"
-                )
+            warnings += _notes_on_fit(fit)
     else:
         warnings.append("no series states its kV: no spectral part, no prediction at other settings")
     evidence[BAD_PIXEL_MAP] = bad_pixel_counts(transfer)
@@ -164,6 +138,48 @@ def calibrate_twin(
         tell("next measurement")
         twin = replace(twin, evidence=evidence | {"next_measurement": advice(twin)})
     return twin
+
+
+def _notes_on_beams(acquisition: AcquisitionFile, transfer: PhotonTransfer, *, dosimeter: bool) -> list[str]:
+    """What the flats' beams leave open: loads, distances, too few voltages where no dosimeter read others."""
+    notes = []
+    with_kV = [level for level in transfer.levels if level.kV is not None]
+    if not any(level.rate_DN_per_mAs for level in with_kV):
+        notes.append("no tube current or power in the flats: levels cannot be predicted, only gains")
+    if acquisition.instrument.pixel_mm is None or acquisition.instrument.source_detector_mm is None:
+        notes.append(
+            "pixel pitch or source-detector distance unknown: the flux scale is not absolute (1 mm and 1 m assumed)"
+        )
+    voltages = {level.kV for level in with_kV}
+    beams = {(level.kV, level.filters) for level in with_kV}
+    if len(beams) == 1 and not dosimeter:
+        notes.append(
+            "flats at one kV and filter only: filtration, scintillator and kV are hardly known; add a second kV or"
+            " the same kV with a known filter"
+        )
+    elif len(voltages) == 1 and not dosimeter:
+        notes.append("flats at one kV only: other tube voltages rest on the spectrum model; add a second kV")
+    return notes
+
+
+def _notes_on_fit(fit: SpectralFit) -> list[str]:
+    """What to know of the spectral part: where spectra were measured, an output that cannot be, data that do not fit."""
+    notes = []
+    correction = fit.posterior.correction
+    if correction is not None:
+        voltages_kV = ", ".join(f"{kV:g}" for kV in correction.kV)
+        notes.append(
+            f"spectra were measured at {voltages_kV} kV; at other voltages the tube model is corrected as between or"
+            " nearest to these"
+        )
+    notes += unlike_output(fit)
+    if contradicts(fit):
+        notes.append(
+            f"levels and gains do not fit the spectral model (chi-square {fit.chi_square:.0f} for {fit.data}"
+            " data), and intervals are widened for it: check kV, filter and power of the series (`raytwin check` looks for"
+            " wrong labels)"
+        )
+    return notes
 
 
 def _check_voltages(acquisition: AcquisitionFile) -> None:

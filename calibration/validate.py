@@ -4,14 +4,14 @@ The levels that calibrated a twin fit it too well to judge it; leaving each out 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.acquisition_io import AcquisitionFile
+from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.cut_off import without_cut_off_darks
 from ..acquisition.setting import Setting, text_from_filters
 from ..errors import InputError
@@ -19,7 +19,7 @@ from ..files import sha256_of_file
 from ..generator.effects import effect_of
 from ..generator.frames.present_line import present_line
 from ..generator.line.measured_flats import measured_flats
-from ..generator.line.twin import Z95, Estimate, Twin
+from ..generator.line.twin import Z95, Estimate, NoiseModel, Twin
 from ..generator.predictions.predict import predict_flatfield
 from ..results import Result, Table, axes_or_new, counted, frame, plain
 from .frames.frame_sums import effective_frames, sum_frames
@@ -243,9 +243,64 @@ def validate_twin(
     """
     tell = progress or (lambda name: None)
     acquisition, cut_off = without_cut_off_darks(acquisition)
+    chosen = _flats_to_compare(twin, acquisition)
+    rho = twin.noise.spread.value.noise_autocovariance(_LAGS)
+    squared_correlations = float(np.sum(rho**2)) / float(rho[_LAGS, _LAGS]) ** 2
+    darks = _dark_means(acquisition)
+    calibrated = {name for level in twin.levels for name in level.series}
+    hashes = str(twin.provenance.get("acquisition_sha256", "")).split("+")
+    known = [sha256_of_file(path) in hashes for path in acquisition.paths]
+    rows, skipped = [], [*cut_off]
+    for item in chosen:
+        tell(item.name)
+        if item.setting is None or item.setting.tube_load_mAs is None:
+            skipped.append(f"{item.name}: kV, exposure or tube load unknown")
+            continue
+        measured = _measured_flat(item, twin, darks, skipped, bits=acquisition.instrument.bits)
+        if measured is None:
+            continue
+        # an effect that came after calibration is not in the flats that calibrated
+        seen = known[item.session] and item.name in calibrated
+        try:
+            predicted = predict_flatfield(twin, item.setting, after_calibration=not seen)
+        except InputError as error:
+            skipped.append(f"{item.name}: {error}")
+            continue
+        skipped += [line for line in predicted.warnings if line.startswith("effect ") and line not in skipped]
+        sampled = _sampled(
+            measured, twin.noise, gain_DN=predicted.gain_DN.value, squared_correlations=squared_correlations
+        )
+        rows.append(
+            ValidationRow(
+                series=item.name,
+                setting=item.setting,
+                role=item.role or "",
+                used_in_calibration=seen,
+                measured_mean_DN=measured.median_DN,
+                measured_sd_DN=None if sampled.variance_DN2 is None else math.sqrt(sampled.variance_DN2),
+                predicted_mean_DN=_widened(predicted.mean_DN, sampled.mean_sd_DN),
+                predicted_sd_DN=_widened(predicted.sd_DN, sampled.noise_sd_DN),
+                extrapolated=predicted.extrapolated,
+            )
+        )
+    wedges = _wedge_rows(twin, acquisition, skipped, known=known)
+    if not rows and not wedges:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received="; ".join(skipped) or "no flats",
+            expected="at least one flat with kV, exposure and tube load that the twin can predict",
+        )
+    return Validation(rows=tuple(rows), skipped=tuple(skipped), wedges=wedges)
+
+
+def _flats_to_compare(twin: Twin, acquisition: AcquisitionFile) -> list[Series]:
+    """The raw flats held back for evaluation if any, else all.
+
+    Raises:
+        InputError: there is none, or they are of another detector or line.
+    """
     flats = [item for item in acquisition.of_kind("flat") if not item.corrected & {"log", "gain"}]
-    held_back = [item for item in flats if item.role == "evaluation"]
-    chosen = held_back or flats
+    chosen = [item for item in flats if item.role == "evaluation"] or flats
     if not chosen:
         raise InputError(
             f"acquisition {acquisition.path}", received="no raw flat series", expected="at least one flat series"
@@ -265,90 +320,89 @@ def validate_twin(
             expected=f"the twin's: {other[1]}",
             remedy="validate against flats of the same tube and detector, or correct what the file states of them",
         )
+    return chosen
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _MeasuredFlat:
+    """Signal above dark and temporal noise of a series of flats, over good pixels.
+
+    Fields: frames; averaged; pixels (good ones); median_DN, mean_DN (signal over pixels); variance_DN2 (temporal, mean over
+    pixels; None of a single frame).
+    """
+
+    frames: int
+    averaged: int
+    pixels: int
+    median_DN: float
+    mean_DN: float
+    variance_DN2: float | None
+
+
+def _measured_flat(
+    item: Series, twin: Twin, darks: Mapping[float | None, NDArray[np.float64]], skipped: list[str], *, bits: int | None
+) -> _MeasuredFlat | None:
+    """What a series of flats shows; None where it cannot be compared. `skipped` is told why, or that it shows no noise."""
     good = twin.maps.bad_pixels == 0
-    rho = twin.noise.spread.value.noise_autocovariance(_LAGS)
-    squared_correlations = float(np.sum(rho**2)) / float(rho[_LAGS, _LAGS]) ** 2
-    darks = _dark_means(acquisition)
-    calibrated = {name for level in twin.levels for name in level.series}
-    hashes = str(twin.provenance.get("acquisition_sha256", "")).split("+")
-    known = [sha256_of_file(path) in hashes for path in acquisition.paths]
-    rows, skipped = [], [*cut_off]
-    for item in chosen:
-        tell(item.name)
-        setting = item.setting
-        # an effect that came after calibration is not in the flats that calibrated
-        seen = known[item.session] and item.name in calibrated
-        if setting is None or setting.tube_load_mAs is None:
-            skipped.append(f"{item.name}: kV, exposure or tube load unknown")
-            continue
-        total = sum_frames(item.iter_frames(), name=f"series {item.name}")
-        if total.frames < 2:
-            skipped.append(f"{item.name}: its noise, which a single frame does not show")
-        if "offset" in item.corrected:
-            dark: Any = 0.0
-        else:
-            dark = darks.get(item.exposure_ms)
-            if dark is None:
-                dark = twin.maps.dark_at(item.exposure_ms)
-        if acquisition.instrument.bits and total.maximum_count > 1e-3 * total.frames * good.size:
-            full = 2.0**acquisition.instrument.bits - 1
-            if total.maximum_DN >= full:
-                skipped.append(f"{item.name}: saturated at {full:g} DN")
-                continue
-        signal = total.mean_DN - dark
-        mean = float(np.median(signal[good]))
-        repeated = total.frames > 1
-        variance = float(np.mean(total.pair_variance_DN2[good])) if repeated else None
-        if mean <= 0 or variance == 0:
-            skipped.append(
-                f"{item.name}: {'no signal above dark' if variance != 0 else 'all frames alike: copies, or no noise'}"
-            )
-            continue
-        try:
-            predicted = predict_flatfield(twin, setting, after_calibration=not seen)
-        except InputError as error:
-            skipped.append(f"{item.name}: {error}")
-            continue
-        skipped += [line for line in predicted.warnings if line.startswith("effect ") and line not in skipped]
-        pixels = int(good.sum())
-        # quantum noise is correlated: the mean over pixels carries gain, not slope
-        spread = predicted.gain_DN.value * mean / item.averaged + twin.noise.read_variance_DN2 / item.averaged
-        common = (
-            0.0 if twin.noise.common_variance is None else twin.noise.common_variance.value * mean**2 / item.averaged
+    total = sum_frames(item.iter_frames(), name=f"series {item.name}")
+    if total.frames < 2:
+        skipped.append(f"{item.name}: its noise, which a single frame does not show")
+    if "offset" in item.corrected:
+        dark: Any = 0.0
+    else:
+        dark = darks.get(item.exposure_ms)
+        if dark is None:
+            dark = twin.maps.dark_at(item.exposure_ms)
+    if bits and total.maximum_count > 1e-3 * total.frames * good.size:
+        full = 2.0**bits - 1
+        if total.maximum_DN >= full:
+            skipped.append(f"{item.name}: saturated at {full:g} DN")
+            return None
+    signal = (total.mean_DN - dark)[good]
+    median = float(np.median(signal))
+    variance = float(np.mean(total.pair_variance_DN2[good])) if total.frames > 1 else None
+    if median <= 0 or variance == 0:
+        skipped.append(
+            f"{item.name}: {'no signal above dark' if variance != 0 else 'all frames alike: copies, or no noise'}"
         )
-        mean_sd = math.sqrt(max(spread, variance or 0.0) / total.frames / pixels) * 1.2533
-        # what pixels share does not average out over them
-        mean_sd = math.hypot(mean_sd, math.sqrt(common / total.frames))
-        noise_sd = 0.0
-        if variance is not None:
-            # neighbours share quantum noise, so a variance over pixels counts fewer of them: by the sum of squared correlations
-            quantum = min(max(1.0 - twin.noise.read_variance_DN2 / item.averaged / variance, 0.0), 1.0)
-            shared = 1.0 + quantum**2 * (squared_correlations - 1.0)
-            sampling = 2.0 * (variance**2 * shared / pixels + common**2) / effective_frames(total.frames)
-            # noise of the pixel with the median signal, which the prediction is of: quanta follow the signal
-            variance *= 1.0 - quantum * (1.0 - mean / float(np.mean(signal[good])))
-            noise_sd = 0.5 * math.sqrt(sampling / variance)
-        rows.append(
-            ValidationRow(
-                series=item.name,
-                setting=setting,
-                role=item.role or "",
-                used_in_calibration=seen,
-                measured_mean_DN=mean,
-                measured_sd_DN=None if variance is None else math.sqrt(variance),
-                predicted_mean_DN=_widened(predicted.mean_DN, mean_sd),
-                predicted_sd_DN=_widened(predicted.sd_DN, noise_sd),
-                extrapolated=predicted.extrapolated,
-            )
-        )
-    wedges = _wedge_rows(twin, acquisition, skipped, known=known)
-    if not rows and not wedges:
-        raise InputError(
-            f"acquisition {acquisition.path}",
-            received="; ".join(skipped) or "no flats",
-            expected="at least one flat with kV, exposure and tube load that the twin can predict",
-        )
-    return Validation(rows=tuple(rows), skipped=tuple(skipped), wedges=wedges)
+        return None
+    return _MeasuredFlat(
+        frames=total.frames,
+        averaged=item.averaged,
+        pixels=int(good.sum()),
+        median_DN=median,
+        mean_DN=float(np.mean(signal)),
+        variance_DN2=variance,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Sampled:
+    """Sampling noise of a measured flat: sd of its level and of its noise, and the variance of the pixel of median signal."""
+
+    mean_sd_DN: float
+    noise_sd_DN: float
+    variance_DN2: float | None
+
+
+def _sampled(flat: _MeasuredFlat, noise: NoiseModel, *, gain_DN: float, squared_correlations: float) -> _Sampled:
+    """By how much a measured flat may be off for its few frames and pixels; gain_DN: of the prediction."""
+    mean, variance = flat.median_DN, flat.variance_DN2
+    # quantum noise is correlated: the mean over pixels carries gain, not slope
+    spread = gain_DN * mean / flat.averaged + noise.read_variance_DN2 / flat.averaged
+    common = 0.0 if noise.common_variance is None else noise.common_variance.value * mean**2 / flat.averaged
+    mean_sd = math.sqrt(max(spread, variance or 0.0) / flat.frames / flat.pixels) * 1.2533
+    # what pixels share does not average out over them
+    mean_sd = math.hypot(mean_sd, math.sqrt(common / flat.frames))
+    if variance is None:
+        return _Sampled(mean_sd_DN=mean_sd, noise_sd_DN=0.0, variance_DN2=None)
+    # neighbours share quantum noise, so a variance over pixels counts fewer of them: by the sum of squared correlations
+    quantum = min(max(1.0 - noise.read_variance_DN2 / flat.averaged / variance, 0.0), 1.0)
+    shared = 1.0 + quantum**2 * (squared_correlations - 1.0)
+    sampling = 2.0 * (variance**2 * shared / flat.pixels + common**2) / effective_frames(flat.frames)
+    # noise of the pixel with the median signal, which the prediction is of: quanta follow the signal
+    variance *= 1.0 - quantum * (1.0 - mean / flat.mean_DN)
+    return _Sampled(mean_sd_DN=mean_sd, noise_sd_DN=0.5 * math.sqrt(sampling / variance), variance_DN2=variance)
 
 
 def _dark_means(acquisition: AcquisitionFile) -> dict[float | None, NDArray[np.float64]]:

@@ -521,16 +521,7 @@ def run_protocol(
     )
     bench = Bench(system, rng=noise_rng, series_count=len(plan.takes))
     begin(plan.frames)
-    series: dict[str, dict[str, Any]] = {}
-    with write_acquisition(path, system.instrument()) as writer:
-        in_beam, rendered = "", None
-        for number, take in enumerate(plan.takes):
-            bench.begin_series(number)
-            if take.scene and take.scene != in_beam:
-                in_beam, product = take.scene, plan.scenes[take.scene]
-                rendered = render(system, product)
-                writer.add_scene(in_beam, kind="product", **_scene_contents(system, product, rendered))
-            series[take.name] = _measure(writer, bench, take, rendered if take.scene else None, advance)
+    series = _measure_plan(path, bench, plan, advance)
     truth: dict[str, Any] = {
         "format": "raytwin-lab-truth",
         "version": 1,
@@ -538,15 +529,7 @@ def run_protocol(
         "seed": seed,
         "session": session,
         "effects": {},
-        "acquisition": Path(path).name,
-        "acquisition_sha256": sha256_of_file(path),
-        **compute_truth(
-            system,
-            settings=[take.setting for take in plan.takes if take.kind != "dark"],
-            exposures_ms=[take.setting.exposure_ms for take in plan.takes],
-        ),
-        "unkindness": None if bench.course is None else bench.course.told(),
-        "series": series,
+        **_truth_of_file(path, bench, plan, series),
     }
     with whole_file(truth_path(path) if truth_file is None else truth_file) as temporary:
         temporary.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
@@ -620,6 +603,40 @@ def _run_session(
         begin=begin,
         advance=advance,
     )
+
+
+def _measure_plan(
+    path: str | os.PathLike[str], bench: Bench, plan: Plan, advance: Callable[[], None]
+) -> dict[str, dict[str, Any]]:
+    """Measure the series of a plan into an acquisition file; series -> what is true of it."""
+    series: dict[str, dict[str, Any]] = {}
+    with write_acquisition(path, bench.system.instrument()) as writer:
+        in_beam, rendered = "", None
+        for number, take in enumerate(plan.takes):
+            bench.begin_series(number)
+            if take.scene and take.scene != in_beam:
+                in_beam, product = take.scene, plan.scenes[take.scene]
+                rendered = render(bench.system, product)
+                writer.add_scene(in_beam, kind="product", **_scene_contents(bench.system, product, rendered))
+            series[take.name] = _measure(writer, bench, take, rendered if take.scene else None, advance)
+    return series
+
+
+def _truth_of_file(
+    path: str | os.PathLike[str], bench: Bench, plan: Plan, series: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """What is true of an acquisition file that a bench measured by a plan; series: what is true of each."""
+    return {
+        "acquisition": Path(path).name,
+        "acquisition_sha256": sha256_of_file(path),
+        **compute_truth(
+            bench.system,
+            settings=[take.setting for take in plan.takes if take.kind != "dark"],
+            exposures_ms=[take.setting.exposure_ms for take in plan.takes],
+        ),
+        "unkindness": None if bench.course is None else bench.course.told(),
+        "series": series,
+    }
 
 
 def _measure(

@@ -15,6 +15,7 @@ from ..spread.noise_power import correlation_of_quanta
 from ..spread.series_scatter import series_differ
 from .flat_levels import SeriesPoint, load_mAs_of, scatter_of_flats
 from .noise_of_flats import FlatNoise
+from .noise_sources import NoiseSource
 from .repeated_frames import beam_of
 
 _POOR_FIT = 2.0  # chi-square a degree of freedom: five standard deviations for 50 degrees
@@ -27,11 +28,7 @@ def flat_evidence(
     fit = noise.fit
     warnings: list[str] = []
     used = [point for point in points if point.used]
-    lit = [p for p in used if p.pair_variance_DN2 > 0 and math.isfinite(p.stack_variance_DN2) and p.frames > 2]
-    weights = np.array([p.frames for p in lit], dtype=np.float64)
-    ratio = (
-        float(np.average([p.stack_variance_DN2 / p.pair_variance_DN2 for p in lit], weights=weights)) if lit else None
-    )
+    ratio = _stack_over_pair_variance(used)
     if ratio is not None and ratio > 1.02:
         warnings.append(
             f"stack variances are {100 * (ratio - 1):.1f} % above pair variances: the level drifts or frames are"
@@ -65,17 +62,9 @@ def flat_evidence(
             f"no kernel family describes the noise power (chi-square {misfit:.1f} per degree of freedom of the best, {fit.family});"
             " the intervals are widened by the misfit"
         )
-    sources = (*noise.of_stacks, *noise.of_pairs, *noise.of_others, *noise.of_darks)
-    names = [item.name for item, _ in noise.stacks]
-    names += [""] * (len(noise.of_pairs) + len(noise.of_others))
-    names += [item.name for item, _ in darks.repeated]
-    ratios = [
-        (name, *ratio)
-        for name, ratio in zip(
-            (name for name, source in zip(names, sources, strict=True) if source.in_fit), fit.series_ratio, strict=True
-        )
-    ]
-    warnings += _uneven(ratios, degrees=len(ratios) - len(fit.gain_DN) - 1)
+    ratios = _ratios_of_series(noise, darks)
+    degrees = len(ratios) - len(fit.gain_DN) - 1
+    warnings += _uneven(ratios, degrees=degrees)
     dark_levels = [
         {
             "series": item.name,
@@ -86,14 +75,6 @@ def flat_evidence(
         }
         for item, total in darks.sums
     ]
-    in_use = [source for source in sources if source.in_fit]
-    bright = [number for number, source in enumerate(in_use) if source.group >= 0]
-    correlation = correlation_of_quanta(
-        [in_use[number].power for number in bright],
-        [fit.expected_DN2[number] + fit.slow_DN2[number] for number in bright],
-        [fit.quanta_DN2[number] for number in bright],
-        unseen_sd=float(np.median(fit.gain_sd_DN / np.maximum(fit.gain_DN, 1e-300))),
-    )
     evidence = {
         "stack_over_pair_variance": ratio,
         "drift_percent_per_series": {p.series: p.drift_percent for p in used},
@@ -101,13 +82,13 @@ def flat_evidence(
         "repeated_settings": repeats,
         "linearity": linearity,
         "scatter_of_flats": scatter_of_flats(used),
-        "scatter_of_noise": _scatter_of_noise(ratios, degrees=len(ratios) - len(fit.gain_DN) - 1),
+        "scatter_of_noise": _scatter_of_noise(ratios, degrees=degrees),
         "dark": dark_levels,
         "line_noise_DN": {
             "rows": math.sqrt(fit.row_variance_DN2),
             "columns": math.sqrt(fit.column_variance_DN2),
         },
-        "noise_correlation": correlation,
+        "noise_correlation": _correlation_of_quanta(noise),
         "spread_fit": {
             "family": fit.family,
             "chi_square_per_degree": misfit,
@@ -122,6 +103,41 @@ def flat_evidence(
         "photon_transfer": [point.as_dict() for point in points],
     }
     return evidence, warnings
+
+
+def _stack_over_pair_variance(points: Sequence[SeriesPoint]) -> float | None:
+    """Mean ratio of the variance about the mean to that of successive frames, weighted by frames; 1 without drift."""
+    lit = [p for p in points if p.pair_variance_DN2 > 0 and math.isfinite(p.stack_variance_DN2) and p.frames > 2]
+    if not lit:
+        return None
+    weights = np.array([p.frames for p in lit], dtype=np.float64)
+    return float(np.average([p.stack_variance_DN2 / p.pair_variance_DN2 for p in lit], weights=weights))
+
+
+def _sources_of(noise: FlatNoise) -> tuple[NoiseSource, ...]:
+    return (*noise.of_stacks, *noise.of_pairs, *noise.of_others, *noise.of_darks)
+
+
+def _ratios_of_series(noise: FlatNoise, darks: DarkFrames) -> list[tuple[str, float, float]]:
+    """Of each series in the fit of the spread: its name (empty where it has none), measured over fitted noise, its sd."""
+    names = [item.name for item, _ in noise.stacks]
+    names += [""] * (len(noise.of_pairs) + len(noise.of_others))
+    names += [item.name for item, _ in darks.repeated]
+    in_fit = [name for name, source in zip(names, _sources_of(noise), strict=True) if source.in_fit]
+    return [(name, *ratio) for name, ratio in zip(in_fit, noise.fit.series_ratio, strict=True)]
+
+
+def _correlation_of_quanta(noise: FlatNoise) -> list[dict[str, float]]:
+    """Correlation of neighbouring pixels' quantum noise in the series of the fit, see `correlation_of_quanta`."""
+    fit = noise.fit
+    in_use = [source for source in _sources_of(noise) if source.in_fit]
+    bright = [number for number, source in enumerate(in_use) if source.group >= 0]
+    return correlation_of_quanta(
+        [in_use[number].power for number in bright],
+        [fit.expected_DN2[number] + fit.slow_DN2[number] for number in bright],
+        [fit.quanta_DN2[number] for number in bright],
+        unseen_sd=float(np.median(fit.gain_sd_DN / np.maximum(fit.gain_DN, 1e-300))),
+    )
 
 
 def _scatter_of_noise(ratios: Sequence[tuple[str, float, float]], *, degrees: int) -> dict[str, float] | None:

@@ -251,21 +251,16 @@ def fit_pod(
             expected="a dictionary: column -> value at which the curve is taken, or None for its median",
         )
     if response is not None or read.response is not None:
-        of_hits = {
-            "method": method,
-            "ceiling": ceiling,
-            "floor": floor,
-            "bootstrap": bootstrap,
-            "by": by,
-            "covariates": covariates,
-            "explain": explain,
-            "as_published": as_published,
-        }
-        for name, asked in of_hits.items():
-            if asked:
-                raise InputError(
-                    name, received="with a response", expected="hits and misses, not a continuous response"
-                )
+        _check_no_word_of_hits(
+            method=method,
+            ceiling=ceiling,
+            floor=floor,
+            bootstrap=bootstrap,
+            by=by,
+            covariates=covariates,
+            explain=explain,
+            as_published=as_published,
+        )
         curve = _response_curve(
             read,
             label=response or "response",
@@ -277,15 +272,9 @@ def fit_pod(
             repeats=repeats,
         )
     else:
-        given = {
-            "decision": decision,
-            "left_censored": left_censored,
-            "right_censored": right_censored,
-            "box_cox": box_cox,
-        }
-        for name, value in given.items():
-            if value is not None:
-                raise InputError(name, received="without a response", expected="the column of a response too")
+        _check_no_word_of_responses(
+            decision=decision, left_censored=left_censored, right_censored=right_censored, box_cox=box_cox
+        )
         curve = _hit_curve(
             read,
             link=link,
@@ -301,12 +290,30 @@ def fit_pod(
             as_published=as_published,
             seed=seed,
         )
-    if len(read.false_alarm) and "false_alarms" not in curve.more:
-        from ..pod import false_alarm_rate
+    return _with_false_alarms(curve)
 
-        alarms = false_alarm_rate(read.false_alarm, network=read.false_alarm_network, image=read.false_alarm_image)
-        curve = replace(curve, more={**curve.more, "false_alarms": asdict(alarms)})
-    return curve
+
+def _check_no_word_of_hits(**words: Any) -> None:
+    for name, asked in words.items():
+        if asked:
+            raise InputError(name, received="with a response", expected="hits and misses, not a continuous response")
+
+
+def _check_no_word_of_responses(**words: Any) -> None:
+    for name, value in words.items():
+        if value is not None:
+            raise InputError(name, received="without a response", expected="the column of a response too")
+
+
+def _with_false_alarms(curve: PodCurve) -> PodCurve:
+    """The curve with the rate of false alarms that its table tells of, where it has none yet."""
+    from ..pod import false_alarm_rate
+
+    table = curve.table
+    if not len(table.false_alarm) or "false_alarms" in curve.more:
+        return curve
+    alarms = false_alarm_rate(table.false_alarm, network=table.false_alarm_network, image=table.false_alarm_image)
+    return replace(curve, more={**curve.more, "false_alarms": asdict(alarms)})
 
 
 def _power(box_cox: float | str | None, *, log_response: bool) -> float | None:

@@ -347,8 +347,6 @@ def generate(
         >>> pairs.images.shape
         (2, 2, 64, 64)
     """
-    from ..acquisition.dataset_io import read_dataset as open_dataset
-    from ..acquisition.tiff_folder import write_tiff_folder
     from ..generator.datasets.belt_motion import twin_on_belt
     from ..generator.predictions.predict_settings import as_setting
     from ..materials import material_from_name
@@ -363,12 +361,6 @@ def generate(
     material_from_name(foreign_material)
     if (reference_low is None) != (reference_high is None):
         raise InputError("reference_low and reference_high", received="one of the two", expected="both or neither")
-    about_references = {
-        "recipe": recipe != "raytwin",
-        "split": split is not None,
-        "registration": registration_px is not None,
-        "reference_low": reference_low is not None,
-    }
     common: dict[str, Any] = {
         "low": targets[0],
         "high": targets[1],
@@ -385,13 +377,12 @@ def generate(
         if description is not None:
             from ..generator.datasets.generate_described import generate_from_description
 
-            for name, given in about_references.items():
-                if given:
-                    raise InputError(
-                        name,
-                        received="a description as REFERENCE",
-                        expected="reference images: the option is about those",
-                    )
+            _check_no_word_of_references(
+                recipe=recipe != "raytwin",
+                split=split is not None,
+                registration=registration_px is not None,
+                reference_low=reference_low is not None,
+            )
             summary = generate_from_description(
                 known, description, path, bad_pixels=bad_pixels, progress=telling.reach, **common
             )
@@ -416,30 +407,49 @@ def generate(
                     progress=telling.reach,
                     **common,
                 )
-        with open_dataset(path) as dataset:
-            warnings, written = (*told, *summary.warnings), None
-            if tiff is not None:
-                folder = write_tiff_folder(dataset, tiff)
-                written = {"folder": folder.folder, "trees": list(folder.trees)}
-                warnings = (*warnings, *folder.notes)
-            arrays: dict[str, Any] = {}
-            if output is None:
-                every = slice(None)
-                arrays = {
-                    "images": dataset.images(every),
-                    "counts": dataset.counts(every),
-                    "foreign_object_masks": dataset.foreign_object_masks(every),
-                    "product_masks": dataset.product_masks(every),
-                    "attributes": dict(dataset.attributes),
-                }
-            return GeneratedPairs(
-                summary=summary,
-                path=None if output is None else path,
-                rows=dataset.rows,
-                tiff=written,
-                warnings=tuple(warnings),
-                **arrays,
+        found = _pairs_of_file(path, summary, in_memory=output is None, tiff=tiff)
+        return dataclasses.replace(found, warnings=(*told, *found.warnings))
+
+
+def _check_no_word_of_references(**words: bool) -> None:
+    for name, given in words.items():
+        if given:
+            raise InputError(
+                name, received="a description as REFERENCE", expected="reference images: the option is about those"
             )
+
+
+def _pairs_of_file(
+    path: Path, summary: "GenerationSummary", *, in_memory: bool, tiff: PathLike | None
+) -> GeneratedPairs:
+    """The pairs that were written to a file, as arrays where the file does not stay; also as TIFF in a folder."""
+    from ..acquisition.dataset_io import read_dataset as open_dataset
+    from ..acquisition.tiff_folder import write_tiff_folder
+
+    with open_dataset(path) as dataset:
+        warnings, written = summary.warnings, None
+        if tiff is not None:
+            folder = write_tiff_folder(dataset, tiff)
+            written = {"folder": folder.folder, "trees": list(folder.trees)}
+            warnings = (*warnings, *folder.notes)
+        arrays: dict[str, Any] = {}
+        if in_memory:
+            every = slice(None)
+            arrays = {
+                "images": dataset.images(every),
+                "counts": dataset.counts(every),
+                "foreign_object_masks": dataset.foreign_object_masks(every),
+                "product_masks": dataset.product_masks(every),
+                "attributes": dict(dataset.attributes),
+            }
+        return GeneratedPairs(
+            summary=summary,
+            path=None if in_memory else path,
+            rows=dataset.rows,
+            tiff=written,
+            warnings=tuple(warnings),
+            **arrays,
+        )
 
 
 def _description_of(reference: Any) -> "Description | None":

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
     from ..acquisition import Dataset
     from ..generator.line.twin import Twin
-    from ..observers import Efficiency, ForeignObjects, LineImages, Sight
+    from ..observers import Efficiency, ForeignObjects, LineImages, Observed, Observer, Sight
+    from ..observers.efficiency import PredictedSizes
 
 _UNITS = {"contrast": "", "size_mm": "mm"}
 _SIZES = 24
@@ -193,23 +194,12 @@ def observe(
     import numpy as np
 
     from ..generator.predictions.contrast import check_pair
-    from ..observers import LineImages, Observer, Sight, materials_seen, observe_settings, predicted_sizes
+    from ..observers import LineImages, Sight, materials_seen, observe_settings, predicted_sizes
 
     pairs = _pairs(settings)
     line = LineImages(as_twin(twin))
     efficiency = _efficiency_of(calibrated)
-    observer = Observer() if efficiency is None else efficiency.observer
-    given = {"detector": detector, "image": image, "false_alarm_rate": false_alarm_rate}
-    changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    if efficiency is not None and changes:
-        raise InputError(
-            ", ".join(changes),
-            received="given with a calibrated observer",
-            expected="those that it was calibrated with",
-            remedy="leave them out",
-        )
-    if changes:
-        observer = Observer(**changes)
+    observer = _observer_of(efficiency, detector=detector, image=image, false_alarm_rate=false_alarm_rate)
     if (references is None) == (product is None and foreign_object is None):
         raise InputError(
             "product and references",
@@ -248,29 +238,19 @@ def observe(
     expected = None if efficiency is None else predicted_sizes(line, pairs, objects, efficiency, texture=texture)
     against = line.reasons_against(pairs, objects, image=observer.image)
     warnings = [*line.warnings, *sight.warnings, *(reason for reason in against if reason), *_outside(line, pairs)]
-    largest = float(objects.size.max())
     if efficiency is None:
         warnings.append(
             "not calibrated to networks: no interval; `calibrate_observer` brings it to the networks of a sweep"
         )
+    largest = float(objects.size.max())
     rows = []
     for number, pair in enumerate(pairs):
-        a90 = math.nan if against[number] else float(found.a90[number])
-        known = math.isfinite(a90)
-        if not known and not against[number]:
+        unseen = bool(against[number])
+        rows.append(_row_of_pair(pair, found, expected, number, unseen=unseen))
+        if rows[-1]["a90"] is None and not unseen:
             beyond = float(found.a90_of_curve[number])
             where = f"; the curve would reach it at {beyond:.3g}" if math.isfinite(beyond) else ""
             warnings.append(f"{pair[0]};{pair[1]}: POD does not pass 90 % within the sizes, up to {largest:.3g}{where}")
-        ends = (None, None) if expected is None else (float(expected.low[number]), float(expected.high[number]))
-        rows.append(
-            {
-                "setting": f"{pair[0]};{pair[1]}",
-                "a50": math.nan if against[number] else float(found.a50[number]),
-                "a90": {"value": a90, "low": ends[0], "high": ends[1]} if known else None,
-                "a90_delta_R": float(found.a90_delta_R[number]) if known else math.nan,
-                "independent_places": float(found.independent_places[number]),
-            }
-        )
     pod = np.where(np.array([bool(reason) for reason in against])[:, None], np.nan, found.pod)
     sizes, curves = _curves(pod, objects)
     words = {
@@ -285,6 +265,39 @@ def observe(
         observer=words,
         warnings=tuple(dict.fromkeys(warnings)),
     )
+
+
+def _observer_of(efficiency: "Efficiency | None", **given: Any) -> "Observer":
+    """The observer as it was calibrated, or as words that are not None ask for."""
+    from ..observers import Observer
+
+    changes = {name: value for name, value in given.items() if value is not None}
+    if efficiency is None:
+        return Observer(**changes)
+    if changes:
+        raise InputError(
+            ", ".join(changes),
+            received="given with a calibrated observer",
+            expected="those that it was calibrated with",
+            remedy="leave them out",
+        )
+    return efficiency.observer
+
+
+def _row_of_pair(
+    pair: tuple[Setting, Setting], found: "Observed", expected: "PredictedSizes | None", number: int, *, unseen: bool
+) -> dict[str, Any]:
+    """What was found at a pair of settings; unseen: there is a reason against it, and no number."""
+    a90 = math.nan if unseen else float(found.a90[number])
+    known = math.isfinite(a90)
+    low, high = (None, None) if expected is None else (float(expected.low[number]), float(expected.high[number]))
+    return {
+        "setting": f"{pair[0]};{pair[1]}",
+        "a50": math.nan if unseen else float(found.a50[number]),
+        "a90": {"value": a90, "low": low, "high": high} if known else None,
+        "a90_delta_R": float(found.a90_delta_R[number]) if known else math.nan,
+        "independent_places": float(found.independent_places[number]),
+    }
 
 
 def calibrate_observer(

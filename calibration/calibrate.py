@@ -11,7 +11,8 @@ from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.cut_off import without_cut_off_darks
 from ..acquisition.setting import Filter
 from ..errors import FitError, InputError
-from ..generator.line.spectral_signal import KV_STEP, OTHER_TABLES, OpenBeam
+from ..generator.line.photon_tables import OTHER_TABLES
+from ..generator.line.spectral_signal import KV_STEP, OpenBeam
 from ..generator.line.twin import BAD_PIXEL_CODES, BAD_PIXEL_MAP, Twin
 from ..generator.twins.twin_answer import calibration_answer
 from ..spectra import (

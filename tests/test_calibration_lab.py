@@ -180,7 +180,7 @@ def test_a_fit_is_not_taken_for_a_prediction(session, tmp_path, capsys):
 
 def test_every_spectrum_is_at_hand_before_frames_are_read(session, monkeypatch):
     # SpekPy's own tables and the maps of a large detector would not fit into 400 MB together
-    from raytwin.generator.line import spectral_signal
+    from raytwin.generator.line import photon_tables
     from raytwin.spectra import tube
 
     stages: list[str] = []
@@ -192,7 +192,7 @@ def test_every_spectrum_is_at_hand_before_frames_are_read(session, monkeypatch):
 
     found = tube.packaged_fluence
     monkeypatch.setattr(tube, "packaged_fluence", recorded)
-    for kept in (tube._tube_node, spectral_signal._kept_fluence):
+    for kept in (tube._tube_node, photon_tables._kept_fluence):
         kept.cache_clear()
     with open_acquisition(session["path"]) as acquisition:
         calibrate_twin(acquisition, rng=np.random.default_rng(2), progress=stages.append)

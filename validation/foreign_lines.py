@@ -51,7 +51,8 @@ from raytwin.calibration.spectrum.priors import GAIN_DISCREPANCY, LEVEL_DISCREPA
 from raytwin.calibration.spectrum.spectral_data import geometry_factor
 from raytwin.calibration.spectrum.spectral_fit import fit_spectrum
 from raytwin.calibration.spectrum.spectral_model import model_for, priors_for
-from raytwin.generator.line.spectral_signal import OTHER_TABLES, OpenBeam, SpectralModel
+from raytwin.generator.line.photon_tables import OTHER_TABLES
+from raytwin.generator.line.spectral_signal import OpenBeam, SpectralModel
 from raytwin.generator.line.twin import DetectorMaps, Level, NoiseModel, Twin, estimate_from_sd, gaussian_spread
 from raytwin.generator.predictions.predict import predict_flatfield
 from raytwin.lab.attenuation import composition, mu_per_mm

@@ -9,10 +9,10 @@ import numpy as np
 from ...acquisition.instrument import Instrument
 from ...acquisition.setting import Filter
 from ...errors import InputError
+from ...generator.line.photon_tables import OTHER_TABLES
 from ...generator.line.spectral_signal import (
     ALTERNATIVE_SCINTILLATOR,
     KERMA_OUTPUT,
-    OTHER_TABLES,
     SHARED_CHARGE,
     THRESHOLD,
     OpenBeam,

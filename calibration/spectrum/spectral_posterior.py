@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...generator.line.photon_tables import OTHER_TABLES
 from ...generator.line.spectral_signal import (
     ALTERNATIVE_SCINTILLATOR,
-    OTHER_TABLES,
     SHARED_CHARGE,
     THRESHOLD,
     OpenBeam,

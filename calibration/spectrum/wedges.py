@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from ...acquisition.acquisition_io import AcquisitionFile, Series
 from ...acquisition.setting import Filter, filters_from_text, text_from_filters
 from ...errors import InputError
-from ...generator.line.spectral_signal import OTHER_TABLES, OpenBeam, attenuation_scale_name
+from ...generator.line.photon_tables import OTHER_TABLES
+from ...generator.line.spectral_signal import OpenBeam, attenuation_scale_name
 from ...generator.line.twin import DetectorMaps, Estimate, SpectralPosterior, Twin, estimate_from_log_draws
 from ...generator.predictions.predict import spectral_model_of
 from ...materials import material_from_name, optical_depth

@@ -3,6 +3,7 @@
 Files:
     twin              the twin: maps, noise, levels per beam, posterior of the spectrum, effects
     spectral_signal   level, gain, photons and kerma of an open beam, for many parameter sets at once
+    photon_tables     what tubes send and scintillators keep at each photon energy, at nodes of voltage and thickness
     measured_flats    the flats that a twin was calibrated with
     twin_spectrum     a twin's spectral model; photon-transfer slope over gain; secondary quanta
     twin_numbers      a twin with another gain or spectrum, its levels moved along

@@ -23,31 +23,33 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...acquisition.instrument import HIGHEST_THRESHOLD_KEV
 from ...acquisition.setting import Filter
 from ...errors import InputError
 from ...materials import material_from_name, mu_per_mm, transmission
-from ...spectra import (
-    BIN_WIDTH_KEV,
-    MAXIMUM_KV,
-    MAXIMUM_KV_OF_ANODE,
-    MINIMUM_KV,
-    MODELS,
-    checked_kV,
-    counted_fraction,
-    detector_response,
-    energy_grid_keV,
-    light_per_keV,
-    tube_fluence_interpolated,
+from ...spectra import BIN_WIDTH_KEV, MAXIMUM_KV, MAXIMUM_KV_OF_ANODE, MINIMUM_KV, checked_kV, energy_grid_keV
+from .photon_tables import (
+    LOG_THICKNESS,
+    NODES_KV,
+    OTHER_TABLES,
+    REFERENCE_KEV,
+    THRESHOLDS_KEV,
+    brackets,
+    counted_tables,
+    fluence_at_nodes,
+    interpolate,
+    levelled,
+    log_ratio_of_models,
+    response_rows,
+    response_tables,
+    table_departure,
 )
 
 REFERENCE_KV = 60.0
-REFERENCE_KEV = 50.0
 FIXED_PARAMETERS = (
     "inherent_filtration_mm_Al",
     "log_scintillator_thickness",
@@ -80,12 +82,9 @@ _RESPONSE_OF_COUNTERS = ("cover_mm_C", "cover_mm_Al", "dead_layer_um")
 _OF_UNDECLARED_COVER = "cover_mm_Al"
 THRESHOLD = "threshold_keV"
 SHARED_CHARGE = "shared_charge"  # share of the photons of a counter whose charge two pixels share
-# thresholds of counters (node,), keV, between which the counted share is linear
-THRESHOLDS_KEV: NDArray[np.float64] = np.linspace(0.0, HIGHEST_THRESHOLD_KEV, 161)
 ALTERNATIVE_SCINTILLATOR = "scintillator_alternative"
 # of a tube whose kerma was measured: its output over the flux that the flats saw (fill factor, distances), logarithm
 KERMA_OUTPUT = "log_kerma_over_flats"
-OTHER_TABLES = ("chantler", "penelope")
 # parameters that say nothing of the tube: a dosimeter does not notice them
 _OF_DETECTOR = (
     "log_DN_per_keV",
@@ -97,23 +96,12 @@ _OF_DETECTOR = (
     *RESPONSE_PARAMETERS,
 )
 _ABSORBER = "absorber_mm:"
-# tube voltages (node,), kV, between which the fluence is linear, half a per cent apart at most: 1e-4 of a signal at 40 kV
-# (behind 0.3 mm of copper 8e-4), a tenth of that from 90 kV on
-_NODES_KV: NDArray[np.float64] = np.concatenate(
-    [0.05 * np.arange(200, 600), 0.1 * np.arange(300, 600), 0.25 * np.arange(240, 1201)]
-)
 LARGEST_KV_ERROR = 0.2
 _USUAL_KV_ERROR = 0.06  # up to it sums end 7 % above the voltage
-_LOWEST_KEV = (
-    5.0  # below, layers that nobody stated count as here: nothing passes a window, and no layer may let through more
-)
 KV_STEP = 0.02  # relative, of the second difference that a varying voltage takes
 _TILT_STEP = 0.002  # relative, of the derivative by the voltage: both sides of a node
-_LOG_THICKNESS = np.linspace(-1.6, 1.6, 33)  # nodes of the scintillator thickness
-_LARGEST_DEPARTURE = 0.1  # between attenuation tables; more is an edge at another place
 _NEAREST_TO_END = 0.02  # of the kV: nearer to the end point it is the voltage that shapes a spectrum
 _OTHER_MODEL = "spectrum_model"  # of twins calibrated before 0.3: a share of the other of SpekPy's models
-_LARGEST_MODEL_RATIO = 0.15  # logarithm of one spectrum model over the other; more is the last bin at the end point
 _Term = tuple[NDArray[np.float64], NDArray[np.float64]]  # error of the tube voltage, relative, and weight (draw,) each
 _DRAWS_KEPT = 4  # sets of draws whose moments a model remembers: a twin asks with the same ones again and again
 
@@ -167,9 +155,7 @@ class SpectrumCorrection:
 
     def at(self, kV: float, bins: int) -> NDArray[np.float64]:
         """Logarithm of the correction on the first `bins` of the common grid (energy,)."""
-        below, share = (
-            _brackets(np.array(self.kV), np.array([kV])) if len(self.kV) > 1 else (np.array([0]), np.zeros(1))
-        )
+        below, share = brackets(np.array(self.kV), np.array([kV])) if len(self.kV) > 1 else (np.array([0]), np.zeros(1))
         first = self.log_ratio[below[0]]
         last = self.log_ratio[min(int(below[0]) + 1, len(self.kV) - 1)]
         row = first + share[0] * (last - first)
@@ -243,13 +229,13 @@ class SpectralModel:
         self._moments_kept: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
         self._other_model: dict[float, NDArray[np.float64]] = {}
         self._responses = [
-            _response_tables(layers, self.cover, self.counting, self.energies_keV.size)
+            response_tables(layers, self.cover, self.counting, self.energies_keV.size)
             for layers in (self.scintillator, self.alternative)
             if layers
         ]
         self._response_names = tuple(name for name in RESPONSE_PARAMETERS if name in self._index)
         self._response_rows = [
-            _response_rows(layers[0], self.energies_keV.size)
+            response_rows(layers[0], self.energies_keV.size)
             for layers in (self.scintillator, self.alternative)
             if layers
         ]
@@ -262,11 +248,21 @@ class SpectralModel:
         self._inherent = transmission(self.inherent, energies, bin_width_keV=BIN_WIDTH_KEV)
         self._depth: dict[Filter, NDArray[np.float64]] = {}
 
+    @property
+    def _tube(self) -> dict[str, Any]:
+        """What tables of fluence are asked with."""
+        return {
+            "anode": self.anode,
+            "anode_angle_deg": self.anode_angle_deg,
+            "model": self.model,
+            "energies_keV": self.energies_keV,
+        }
+
     def _departure(self, material: str, table: str) -> NDArray[np.float64]:
         """Another table's attenuation over xraylib's, less 1 (energy,)."""
         key = (material, table)
         if key not in self._departures:
-            self._departures[key] = _table_departure(material, table, self.energies_keV)
+            self._departures[key] = table_departure(material, table, self.energies_keV)
         return self._departures[key]
 
     def with_parameters(self, names: Sequence[str]) -> "SpectralModel":
@@ -315,7 +311,7 @@ class SpectralModel:
         checked_kV(kV, anode=self.anode)
         highest = MAXIMUM_KV_OF_ANODE.get(self.anode, MAXIMUM_KV)
         found = [
-            (*_brackets(_NODES_KV, np.clip(kV * (1.0 + _within(error)), MINIMUM_KV, highest)), weight)
+            (*brackets(NODES_KV, np.clip(kV * (1.0 + _within(error)), MINIMUM_KV, highest)), weight)
             for error, weight in terms
         ]
         first = min(int(below.min()) for below, _, _ in found)
@@ -326,41 +322,12 @@ class SpectralModel:
             shares[rows, below - first + 1] += weight * share
         # each node may cost spectra that nobody has computed yet
         used = np.flatnonzero(np.any(shares != 0.0, axis=0))
-        kept = _kept_fluence(self.anode, self.anode_angle_deg, self.model, self.energies_keV.size)
-        for node in used:
-            if np.isnan(kept[first + node, 0]):
-                kept[first + node] = tube_fluence_interpolated(
-                    float(_NODES_KV[first + node]),
-                    energies_keV=self.energies_keV,
-                    anode=self.anode,
-                    anode_angle_deg=self.anode_angle_deg,
-                    model=self.model,
-                    for_sums=True,
-                )
-        return np.asarray(shares[:, used] @ kept[first + used, :top])
+        return np.asarray(shares[:, used] @ fluence_at_nodes(first + used, top, **self._tube))
 
     def _towards_other_model(self, kV: float) -> NDArray[np.float64]:
         """Logarithm of the other of SpekPy's models over this one (energy,), held constant beyond the end point."""
         if kV not in self._other_model:
-            lowest = MINIMUM_KV
-            ratio = np.zeros(self.energies_keV.size)
-            if kV >= lowest:
-                both = [
-                    tube_fluence_interpolated(
-                        kV,
-                        energies_keV=self.energies_keV,
-                        anode=self.anode,
-                        anode_angle_deg=self.anode_angle_deg,
-                        model=name,
-                    )
-                    for name in (self.model, next(name for name in MODELS if name != self.model))
-                ]
-                seen = (both[0] > 1e-9 * both[0].max()) & (both[1] > 0)
-                if np.any(seen):
-                    ratio[seen] = np.log(both[1][seen] / both[0][seen])
-                    last = int(np.flatnonzero(seen)[-1])
-                    ratio[last + 1 :] = ratio[last]
-            self._other_model[kV] = np.clip(ratio, -_LARGEST_MODEL_RATIO, _LARGEST_MODEL_RATIO)
+            self._other_model[kV] = log_ratio_of_models(kV, **self._tube)
         return self._other_model[kV]
 
     def default_parameters(self) -> NDArray[np.float64]:
@@ -500,7 +467,7 @@ class SpectralModel:
         return np.stack([signal, variance, photons * share])
 
     def deposit_tables(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What each draw's scintillator does at each energy (6, draw, energy): see `_response_tables`, the share left out.
+        """What each draw's scintillator does at each energy (6, draw, energy): see `response_tables`, the share left out.
 
         The first two hold the draw's own table and escape parameters; the next ones are the derivatives by these.
         """
@@ -510,17 +477,17 @@ class SpectralModel:
         for chosen, tables in zip((~other, other), self._responses, strict=False):
             if chosen.any():
                 for row, table in enumerate((*tables[:2], *tables[3:])):
-                    found[row, chosen] = _interpolate(_LOG_THICKNESS, table, log_thickness[chosen])
+                    found[row, chosen] = interpolate(LOG_THICKNESS, table, log_thickness[chosen])
         by_table, by_escape = (self._column(samples, name)[:, None] for name in ("scintillator_table", "escape_scale"))
         found[0] += by_table * found[2] + by_escape * found[4]
         found[1] += by_table * found[3] + by_escape * found[5]
         if THRESHOLD in self._index:
             thresholds = self._column(samples, THRESHOLD)
-            tables = _counted_tables(self.scintillator[0], self.energies_keV.size)
+            tables = counted_tables(self.scintillator[0], self.energies_keV.size)
             alone, shared = (
                 escaping + by_escape * (escaping - kept)
                 for escaping, kept in (
-                    [_interpolate(THRESHOLDS_KEV, table, thresholds) for table in pair] for pair in tables
+                    [interpolate(THRESHOLDS_KEV, table, thresholds) for table in pair] for pair in tables
                 )
             )
             found *= alone + self._column(samples, SHARED_CHARGE)[:, None] * (shared - alone)
@@ -571,7 +538,7 @@ class SpectralModel:
         moments[:2] = self.deposit_tables(samples)[:2]
         for chosen, tables in zip((~other, other), self._responses, strict=False):
             if chosen.any():
-                moments[2, chosen] = _interpolate(_LOG_THICKNESS, tables[2], log_thickness[chosen])
+                moments[2, chosen] = interpolate(LOG_THICKNESS, tables[2], log_thickness[chosen])
         powers = self._response_powers(samples, bins)
         if powers is not None:
             moments[2] *= powers[2]
@@ -732,7 +699,7 @@ class SpectralModel:
         if name == _OTHER_MODEL:
             return self._towards_other_model(beam.kV)[:top]
         if name == "anode_roughness_um":
-            return -1e-3 * _levelled(self.mu(self.anode), self.energies_keV)[:top]
+            return -1e-3 * levelled(self.mu(self.anode), self.energies_keV)[:top]
         row = None
         for layer in beam.filters:
             if name == attenuation_scale_name(layer.material):
@@ -747,105 +714,6 @@ class SpectralModel:
         if name not in self._index:
             return np.zeros(len(samples))
         return np.asarray(samples[:, self._index[name]])
-
-
-def _table_departure(material: str, table: str, energies_keV: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Another table's attenuation over xraylib's, less 1 (energy,)."""
-    known = material_from_name(material)
-    ratio = mu_per_mm(known, energies_keV, table=table) / mu_per_mm(known, energies_keV)
-    # the tables' edges lie a few eV apart: a bin between them says nothing of the tables
-    return np.clip(ratio - 1.0, -_LARGEST_DEPARTURE, _LARGEST_DEPARTURE)
-
-
-def _levelled(values: NDArray[np.float64], energies_keV: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values (energy,) with those below the lowest energy that matters replaced by the value there."""
-    first = min(int(np.searchsorted(energies_keV, _LOWEST_KEV)), len(values) - 1)
-    return np.concatenate([np.full(first, values[first]), values[first:]])
-
-
-@lru_cache(maxsize=16)
-def _response_rows(layer: Filter, bins: int) -> dict[str, NDArray[np.float64]]:
-    """What a unit of each response parameter adds to the logarithms at each energy (energy,), for a scintillator's first layer.
-
-    The depth slope is the loss of light from the diode's side of the layer to the other, as a share: row <z> / L - 1 / 2,
-    with z the depth at which photons of an energy are stopped.
-    """
-    energies = energy_grid_keV(500.0)[:bins]
-    absorber = mu_per_mm(material_from_name(layer.material), energies)
-    depth = np.maximum(absorber * layer.thickness_mm, 1e-6)
-    logarithm = np.log(energies / REFERENCE_KEV)
-    rows = {
-        "cover_mm_C": -_levelled(mu_per_mm(material_from_name("C"), energies), energies),
-        "cover_mm_Al": -_levelled(mu_per_mm(material_from_name("Al"), energies), energies),
-        "dead_layer_um": -1e-3 * _levelled(absorber, energies),
-        "light_nonproportionality": light_per_keV(layer.material, energies),
-        "light_exponent": logarithm,
-        "light_depth_slope": 1.0 / depth - 1.0 / np.expm1(np.minimum(depth, 500.0)) - 0.5,
-        "swank_exponent": logarithm,
-    }
-    for row in rows.values():
-        row.setflags(write=False)
-    return rows
-
-
-@lru_cache(maxsize=16)
-def _response_tables(
-    scintillator: tuple[Filter, ...], cover: tuple[Filter, ...], counting: bool, bins: int
-) -> NDArray[np.float64]:
-    """What a photon leaves in a scintillator (quantity, node of thickness, energy), on the first bins of the grid.
-
-    Quantities: mean deposit, mean square deposit, interacting share; what the other attenuation tables add to the first
-    two; what full escape of K photons takes from the first two.
-    """
-    energies = energy_grid_keV(500.0)[:bins]
-
-    def tables(escape: bool) -> NDArray[np.float64]:
-        rows = []
-        for log_scale in _LOG_THICKNESS:
-            layers = tuple(
-                Filter(material=layer.material, thickness_mm=layer.thickness_mm * float(np.exp(log_scale)))
-                for layer in scintillator
-            )
-            found = detector_response(
-                scintillator=layers, cover=cover, counting=counting, energies_keV=energies, escape=escape
-            )
-            rows.append((found.mean_deposited_keV, found.mean_square_deposited_keV2, found.interacting_fraction))
-        return np.array(rows).transpose(1, 0, 2)
-
-    escaping, kept = tables(True), tables(False)
-    departure = np.mean([_table_departure(scintillator[0].material, name, energies) for name in OTHER_TABLES], axis=0)
-    # a larger coefficient at one energy is a thicker layer at that energy
-    by_table = np.gradient(escaping[:2], _LOG_THICKNESS, axis=1) * departure
-    result = np.concatenate([escaping, by_table, escaping[:2] - kept[:2]])
-    result.setflags(write=False)
-    return np.asarray(result)
-
-
-@lru_cache(maxsize=16)
-def _counted_tables(layer: Filter, bins: int) -> NDArray[np.float64]:
-    """Counts of a photon that interacts in a counter's layer (2, 2, node of threshold, energy).
-
-    Along the first axis: of charge that one pixel has, and that two pixels share; along the second: all K photons that a slab
-    lets out leave, and none does.
-    """
-    energies = energy_grid_keV(500.0)[:bins]
-    tables = [
-        [
-            counted_fraction(
-                energies_keV=energies, threshold_keV=THRESHOLDS_KEV, layer=layer, escape=escape, shared=shared
-            )
-            for escape in (True, False)
-        ]
-        for shared in (False, True)
-    ]
-    return np.array(tables)
-
-
-def _brackets(nodes: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    clipped = np.clip(at, nodes[0], nodes[-1])
-    below = np.clip(np.searchsorted(nodes, clipped, side="right") - 1, 0, len(nodes) - 2)
-    share = (clipped - nodes[below]) / (nodes[below + 1] - nodes[below])
-    return below, share
 
 
 def _within(kV_error: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -864,27 +732,6 @@ def _varying(kV_error: NDArray[np.float64], variance: NDArray[np.float64]) -> li
     """Terms of the fluence at errors (draw,) of a voltage that varies about them by relative variances (draw,)."""
     mean = (kV_error, np.ones(len(kV_error)))
     return [mean, *_second_difference(kV_error, variance)] if np.any(variance) else [mean]
-
-
-@lru_cache(maxsize=16)
-def _kept_fluence(anode: str, anode_angle_deg: float, model: str, bins: int) -> NDArray[np.float64]:
-    """A tube's fluence at `_NODES_KV` (node, energy) on the first bins of the grid; NaN where nobody has computed it yet."""
-    return np.full((_NODES_KV.size, bins), np.nan)
-
-
-def _interpolate(
-    nodes: NDArray[np.float64], table: NDArray[np.float64], at: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Rows of `table` (node, energy) at positions `at` (draw,), linear between nodes."""
-    below, share = _brackets(nodes, at)
-    lowest, highest = int(below.min()), int(below.max()) + 2
-    if len(at) < 2 * (highest - lowest):
-        return np.asarray(table[below] * (1.0 - share)[:, None] + table[below + 1] * share[:, None])
-    weights = np.zeros((len(at), highest - lowest))
-    rows = np.arange(len(at))
-    weights[rows, below - lowest] = 1.0 - share
-    weights[rows, below - lowest + 1] = share
-    return np.asarray(weights @ table[lowest:highest])
 
 
 def gain_behind_object(

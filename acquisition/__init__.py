@@ -5,6 +5,7 @@ Files:
     instrument            the line as its owner describes it
     acquisition_io        the acquisition file; _acquisition_words: its words
     acquisition_writer    series and scenes as they are written
+    scenes                what stood in the beam
     instrument_io         the instrument in a file
     dataset_io            the dataset file
     pairs                 dark and flat correction, pairs by scene
@@ -44,7 +45,6 @@ from .setting import Filter, Setting, filter_from_text, filters_from_text, setti
 if TYPE_CHECKING:
     from .acquisition_io import (
         AcquisitionFile,
-        Scene,
         Series,
         open_acquisition,
         write_acquisition,
@@ -77,6 +77,7 @@ if TYPE_CHECKING:
         split_by_product,
         unpaired_objects,
     )
+    from .scenes import Scene
 
 _LAZY = {
     "DatasetSummary": "pairs",
@@ -95,7 +96,7 @@ _LAZY = {
     "dilations_for_pixel": "contrast",
     "AcquisitionFile": "acquisition_io",
     "AcquisitionWriter": "acquisition_writer",
-    "Scene": "acquisition_io",
+    "Scene": "scenes",
     "Series": "acquisition_io",
     "SeriesWriter": "acquisition_writer",
     "open_acquisition": "acquisition_io",

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .acquisition_io import AcquisitionFile, Scene, Series
+from .acquisition_io import AcquisitionFile, Series
 from .log_images import logarithm_of_share, transmitted_share
+from .scenes import Scene
 
 
 def binned(acquisition: AcquisitionFile, factor: int) -> AcquisitionFile:

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, MissingDependencyError
 from ..files import whole_folder
-from .acquisition_io import AcquisitionFile, Scene, Series
+from .acquisition_io import AcquisitionFile, Series
 from .instrument import LAYER_FIELDS
+from .scenes import Scene
 from .setting import Filter, text_from_filters
 from .tiff_tags import write_tiff
 

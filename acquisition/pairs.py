@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .acquisition_io import AcquisitionFile, Scene, Series
+from .acquisition_io import AcquisitionFile, Series
 from .contrast import DILATIONS, PRODUCT_THRESHOLD, check_dilations, delta_r
 from .dataset_io import DatasetRow, write_dataset
 from .log_images import holds_shares, logarithm_of_share
+from .scenes import Scene
 from .setting import Setting
 
 _SAME = 1e-6

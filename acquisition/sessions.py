@@ -6,8 +6,9 @@ from types import MappingProxyType
 from typing import Any
 
 from ..errors import InputError
-from .acquisition_io import AcquisitionFile, Scene, Series
+from .acquisition_io import AcquisitionFile, Series
 from .instrument import Instrument
+from .scenes import Scene
 
 LATER_S = 3600.0  # from the end of a session to what was measured later
 

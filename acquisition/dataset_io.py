@@ -27,6 +27,7 @@ from ._hdf5 import (
     reading,
     real_numbers,
 )
+from .instrument import Instrument
 
 FORMAT = "raytwin-dataset"
 VERSION = 1
@@ -89,6 +90,24 @@ class Dataset:
     shape: tuple[int, int]
     attributes: Mapping[str, Any]
     _file: Any
+
+    def refuse_other_pitch(self, pixel_mm: float | None) -> None:
+        """Refuse images whose file states another pitch of the detector than `pixel_mm`.
+
+        Raises:
+            InputError: it does.
+        """
+        stated = self.attributes.get("pixel_mm")
+        if not (pixel_mm and isinstance(stated, float | int)) or not stated > 0:
+            return
+        other = Instrument(pixel_mm=pixel_mm).unlike(Instrument(pixel_mm=float(stated)))
+        if other is not None:
+            raise InputError(
+                self.path,
+                received=f"images with {other[0]}",
+                expected=f"the twin's: {other[1]}",
+                remedy="take the twin of the detector that took them",
+            )
 
     def __enter__(self) -> Self:
         return self

@@ -80,10 +80,11 @@ def objects_of_references(
         numbers: images to take; None: all.
 
     Raises:
-        InputError: fewer than five such objects, or images of several settings.
+        InputError: fewer than five such objects, or images of several settings or of another pitch.
     """
     from scipy.ndimage import binary_dilation, find_objects
 
+    dataset.refuse_other_pitch(pixel_mm)
     chosen = range(len(dataset)) if numbers is None else numbers
     names, contrast, size_mm, ring_log, masks, area = [], [], [], [], [], []
     settings = set()

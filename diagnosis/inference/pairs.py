@@ -55,7 +55,8 @@ class Pair:
 def weigh_pairs(
     observed: Observed, singles: Mapping[str, Single], *, leading: int, beside: Sequence[Curve] = ()
 ) -> list[Pair]:
-    """The effects that explain most, so many as `leading` says, each with every other one: those that are likely at first sight.
+    """The effects that explain most, so many as `leading` says (with laws off, and with exact ones), each with every other one: those
+    that are likely at first sight.
 
     Of each of them the pair with its best companion is among these.
 
@@ -77,8 +78,10 @@ def weigh_pairs(
         ]
 
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
+    # alone, what another effect does is counted as its law's error: with exact laws each is as good as it is beside the other
+    exact = sorted(singles, key=lambda effect: -max(fit.by_level[0] for fit in singles[effect].fits))
     seen: dict[tuple[str, str], tuple[float, Point, str]] = {}
-    for first in ranked[:leading]:
+    for first in dict.fromkeys([*ranked[:leading], *exact[:leading]]):
         best = singles[first].best
         point = best.at_level(min(best.level, FARTHEST_LEVEL))
         for second, evidence in _at_first_sight(observed, point, [one for one in singles if one != first], curves):

@@ -17,6 +17,7 @@ from ..problem.problem import Problem, SeriesView
 from .strengths import strengths_on
 
 _DRAWS = 300
+_MOSTLY = 0.5  # of the gap above noise, from which what takes so much explains it
 _MOST_TESTED = 0.5  # of what an explanation does, as a share of its squares
 
 
@@ -42,6 +43,13 @@ class Gap:
     def falls(self) -> bool:
         """Whether the twin is nearer with what was found added."""
         return self.after < self.before
+
+    @property
+    def explained(self) -> bool:
+        """Whether what was found takes most of what is above noise, as far as held-out data can tell."""
+        if not self.tested or self.at_floor:
+            return True
+        return self.falls and (self.shrinks_by is None or self.shrinks_by[0] > _MOSTLY)
 
 
 def folds_of(problem: Problem) -> NDArray[np.intp]:

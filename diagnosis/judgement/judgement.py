@@ -61,7 +61,7 @@ def judge(
     as_read = replace(leading, strengths={effect: strength_of(problem, leading, effect) for effect in leading.variants})
     ambiguous = verdict.word == "ambiguous"
     return Diagnosis(
-        verdict=verdict.word,
+        verdict="explained_in_part" if verdict.word == "explained" and not gap.explained else verdict.word,
         hypotheses=verdict.hypotheses,
         causes=_causes(problem, verdict, shares | likeliest, _places_left(problem, as_read)),
         probability_no_gap=next((item.probability for item in verdict.hypotheses if not item.effects), 0.0),

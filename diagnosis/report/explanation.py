@@ -17,7 +17,6 @@ _NAMED_FAMILIES = 4
 _RIVALS, _LEAST_LIKELY = 5, 0.05  # explanations that are named where none leads
 _UNTESTED = "It shows in series that no others tell the strength of, so that no held-out data could test it."
 _WIDE = 160  # characters of a line: titles and strengths of the longest units fit
-_MOSTLY = 0.5  # of the gap above noise, from which what takes so much explains it
 _FINDING_TITLES = {
     FindingCode.STOPS: "Numbers are cut off early",
     FindingCode.SPECTRUM: "The flats fit no spectrum",
@@ -198,12 +197,9 @@ def _causes(diagnosis: Diagnosis) -> Table:
 
 def _relation(gap: Gap) -> str:
     """What effects that are named are to the gap."""
-    share = None if gap.shrinks_by is None else gap.shrinks_by[0]
     if gap.at_floor or not gap.tested:
         return "Observed there"
-    if gap.falls and (share is None or share > _MOSTLY):
-        return "It is explained by"
-    return "Of the catalogue it is most like"
+    return "It is explained by" if gap.explained else "Of the catalogue it is most like"
 
 
 def _figures(gap: Gap) -> str:

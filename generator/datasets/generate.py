@@ -526,6 +526,7 @@ class ReferenceImages:
                 expected=f"the twin's detector, {twin.maps.shape} (row, column)",
                 remedy="calibrate from flats of the detector that took the references",
             )
+        reference.refuse_other_pitch(twin.instrument.pixel_mm)
         self.numbers = [int(number) for number in reference.indices(split=split)]
         if not self.numbers:
             raise InputError(

@@ -471,6 +471,18 @@ def test_a_second_effect_elsewhere_is_named_beside_a_strong_one():
     assert alone[0].effects == ("strong",)
 
 
+@pytest.mark.parametrize("unlike", [0.45, 0.65])
+def test_a_pair_is_found_though_two_others_are_each_more_like_their_sum(unlike):
+    rng = np.random.default_rng(3)
+    first, second = 4.0 * rng.standard_normal((2, PROBES))
+    likely = [(first + second) * np.exp(unlike * factor) for factor in rng.standard_normal((2, PROBES))]
+    chosen = [one_node(name, shape) for name, shape in zip("abcd", (first, second, *likely), strict=True)]
+    observed = seen(first + second + rng.standard_normal(PROBES))
+    singles = _singles(fit_effects(observed, chosen))
+    assert min(singles[name].log_evidence for name in "cd") > max(singles[name].log_evidence for name in "ab") + 100.0
+    assert weigh(observed.residual, None, chosen)[0].effects == ("a", "b")
+
+
 def test_a_pair_has_the_variant_that_is_best_beside_the_other_and_not_the_one_that_is_best_alone():
     u, w = np.zeros(PROBES), np.zeros(PROBES)
     u[:200], w[200:400] = 1.0, 1.0

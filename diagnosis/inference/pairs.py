@@ -55,10 +55,9 @@ class Pair:
 def weigh_pairs(
     observed: Observed, singles: Mapping[str, Single], *, leading: int, beside: Sequence[Curve] = ()
 ) -> list[Pair]:
-    """The effects that explain most, so many as `leading` says (with laws off, and with exact ones), each with every other one: those
-    that are likely at first sight.
+    """The effects that explain most, so many as `leading` says, each with every other one: those that are likely at first sight.
 
-    Of each of them the pair with its best companion is among these.
+    Of each of them the pair with its best companion is among these, and so is the pair that explains most if all laws are exact.
 
     Args:
         observed: what is weighed.
@@ -78,10 +77,8 @@ def weigh_pairs(
         ]
 
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
-    # alone, what another effect does is counted as its law's error: with exact laws each is as good as it is beside the other
-    exact = sorted(singles, key=lambda effect: -max(fit.by_level[0] for fit in singles[effect].fits))
     seen: dict[tuple[str, str], tuple[float, Point, str]] = {}
-    for first in dict.fromkeys([*ranked[:leading], *exact[:leading]]):
+    for first in ranked[:leading]:
         best = singles[first].best
         point = best.at_level(min(best.level, FARTHEST_LEVEL))
         for second, evidence in _at_first_sight(observed, point, [one for one in singles if one != first], curves):
@@ -95,12 +92,54 @@ def weigh_pairs(
         companions.setdefault(item[1].curve.effect, item)
     taken = likely[:_IN_FULL]
     taken += [item for item in companions.values() if not any(item is one for one in taken)]
+    starts = [(singles[point.curve.effect].best, point, other) for _, point, other in taken]
+    start = _together_exactly(observed, singles)
+    if start is not None and {start[1].curve.effect, start[2]} not in [
+        {at.curve.effect, other} for _, at, other in starts
+    ]:
+        starts.append(start)
     result = []
-    for _, point, other in taken:
+    for fit, point, other in starts:
         first = point.curve.effect
         both = {first: curves(first, other), other: curves(other, first)}
-        result.append(_settled(observed, singles[first].best, point, both, other))
+        result.append(_settled(observed, fit, point, both, other))
     return result
+
+
+def _together_exactly(observed: Observed, singles: Mapping[str, Single]) -> tuple[CurveFit, Point, str] | None:
+    """The two effects that explain most together if their laws are exact: fit and place of the one that explains more, and the other.
+
+    Alone, each counts what the other does as its law's error, so that neither need be among those that explain most. Responses are
+    taken as straight in the strength; effects that the twin has, or that only act by chance, take no part.
+    """
+    fits = [
+        fit
+        for effect, single in singles.items()
+        if not observed.has(effect)
+        for fit in single.fits
+        if not fit.curve.by_chance_alone
+    ]
+    alone = observed.conditioned()
+    moved = np.stack([alone.residual, *(alone.scaled(fit.curve).response(fit.best) for fit in fits)])
+    inner = alone.nuisances.inner(moved, moved)
+    asked, gram = inner[0, 1:], inner[1:, 1:]
+    own = np.maximum(np.diag(gram), 1e-12)
+    free = np.maximum(np.outer(own, own) - gram**2, 1e-9 * np.outer(own, own))
+    times = (
+        own[None, :] * asked[:, None] - gram * asked[None, :]
+    ) / free  # how many times its strength each has beside another
+    effects = np.array([fit.curve.effect for fit in fits])
+    apart = (effects[:, None] != effects[None, :]) & (times > 0.0) & (times.T > 0.0)
+    if not np.any(apart):
+        return None
+    explained = asked[:, None] * times
+    both = np.where(apart, explained + explained.T, -np.inf)
+    first, second = np.unravel_index(int(np.argmax(both)), both.shape)
+    if explained[second, first] > explained[first, second]:
+        first, second = second, first
+    fit = fits[first]
+    strength = float(np.clip(times[first, second] * fit.best, fit.strengths[0], fit.strengths[-1]))
+    return fit, Point(curve=fit.curve, strength=strength, level=0.0, share=fit.share), str(effects[second])
 
 
 def _at_first_sight(

@@ -74,6 +74,12 @@ class Instrument:
                     received=value,
                     expected=f"a finite positive number, at most {LARGEST:g}",
                 )
+        if self.source_object_mm and self.source_detector_mm and self.source_object_mm > self.source_detector_mm:
+            raise InputError(
+                "instrument source_object_mm",
+                received=f"{self.source_object_mm:g} mm, with the detector at {self.source_detector_mm:g} mm",
+                expected="an object between source and detector",
+            )
         if self.bits is not None and self.bits > MOST_BITS:
             raise InputError("instrument bits", received=self.bits, expected=f"a whole number from 1 to {MOST_BITS}")
         if self.detector is not None and self.detector not in DETECTORS:

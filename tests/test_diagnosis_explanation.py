@@ -113,6 +113,8 @@ def test_the_printed_answer_is_a_headline_a_table_and_a_sentence_a_line():
     assert lines[3] == "It is explained by:"
     assert lines[4].split("  ")[0] == "effect"
     assert lines[5].endswith("0.94         12.3 % (9.9 to 14.8)  always there  80 %")
+    means = "scatter over primary at the centre of this field behind 20 mm of water, usual gap, at the reference energy"
+    assert lines[6] == f"Strength (radiation scattered by the object): {means}."
     assert lines[-2].endswith("by 82 % (75 to 90) of what is above noise.")
     assert lines[-1] == "Three series moved."
 

@@ -8,7 +8,7 @@ from ...results import Table
 from ..inference.inference import title_of
 from ..judgement.answer import EXPLAINED, Diagnosis, Place
 from ..judgement.held_out import Gap
-from .words import axis_text, family_text, nuisance_text, place_text, share_text, strength_text, when_text
+from .words import axis_text, family_text, meaning_text, nuisance_text, place_text, share_text, strength_text, when_text
 
 # so many of a kind fit into a sentence
 _NAMED = 3
@@ -95,7 +95,7 @@ def answer_text(diagnosis: Diagnosis) -> str:
         lines += [*(item.line for item in diagnosis.findings), "All else is of the other series."]
     if _explained(diagnosis):
         lines += _where(diagnosis.where)
-        lines += [_causes(diagnosis).as_text(widest=_WIDE), *_fall(diagnosis)]
+        lines += [_causes(diagnosis).as_text(widest=_WIDE), *_meanings(diagnosis), *_fall(diagnosis)]
     else:
         lines += _not_explained(diagnosis)
     if diagnosis.not_tested or diagnosis.warnings:
@@ -193,6 +193,12 @@ def _causes(diagnosis: Diagnosis) -> Table:
     )
     header = ("effect", "probability", "strength (95 %)", "when", "removed")
     return Table(title=f"{_relation(diagnosis.gap)}:", header=header, rows=rows)
+
+
+def _meanings(diagnosis: Diagnosis) -> list[str]:
+    """What the strengths of what is named are, a sentence each."""
+    told = [(title_of(cause.effect), meaning_text(cause.effect)) for cause in diagnosis.leading]
+    return [f"Strength ({title}): {meaning}." for title, meaning in told if meaning]
 
 
 def _relation(gap: Gap) -> str:

@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Sequence
 
+from ...generator.effects import EFFECTS
 from ..inference.inference import title_of
 from ..judgement.answer import Cause, Place
 
@@ -116,6 +117,11 @@ def strength_text(cause: Cause) -> str:
     value, low, high = cause.strength
     digits = min(max(0, 2 - math.floor(math.log10(max(abs(value), 1e-9)))), 4)
     return f"{value:.{digits}f} {cause.unit} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def meaning_text(effect: str) -> str:
+    """What the strength of an effect is; empty where the catalogue does not hold it."""
+    return EFFECTS[effect].strength.source.split(";")[0] if effect in EFFECTS else ""
 
 
 def when_text(cause: Cause) -> str:

@@ -29,7 +29,7 @@ EXCESS_NOISE = Effect(
             low=3.0,
             high=100.0,
             default=20.0,
-            source="of the quantum variance; a Swank factor that falls from 0.95 to 0.5 adds 90 %",
+            source="more quantum variance; a Swank factor that falls from 0.95 to 0.5 adds 90 %",
             log=False,
         ),
     ),

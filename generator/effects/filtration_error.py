@@ -31,7 +31,7 @@ FILTRATION_ERROR = Effect(
             low=0.03,
             high=1.0,
             default=0.2,
-            source="anode roughening, an exchanged window or a forgotten sheet",
+            source="aluminium that the beam crosses more than calibrated; a roughened anode, an exchanged window, a forgotten sheet",
             log=False,
         ),
     ),

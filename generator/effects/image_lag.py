@@ -53,7 +53,7 @@ IMAGE_LAG = Effect(
             low=0.02,
             high=5.0,
             default=1.0,
-            source="first beam-off frame over the last exposed one",
+            source="first beam-off frame over the last exposed one, after 5 s of exposure; another time is `after_s`",
             log=True,
             most=100.0,
         ),

@@ -55,7 +55,7 @@ KV_ERROR = Effect(
             low=0.5,
             high=5.0,
             default=1.0,
-            source="IEC 61223 allows 5-10 % of the voltage",
+            source="relative change of the voltage; IEC 61223 allows 5-10 %",
             log=False,
             signed=True,
         ),

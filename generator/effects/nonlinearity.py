@@ -32,7 +32,8 @@ NONLINEARITY = Effect(
             low=0.3,
             high=5.0,
             default=1.0,
-            source="departure from the initial line at half of `highest_signal_DN`, full scale of the ADC where that is 0",
+            source="how far the response lies below its initial line (negative: above) at half of full scale; full scale is "
+            "`highest_signal_DN`, the ADC's where that is 0",
             log=False,
             signed=True,
         ),

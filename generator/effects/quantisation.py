@@ -28,7 +28,15 @@ QUANTISATION = Effect(
     title="ADC with lost bits",
     law=r"y \to s\,\lfloor y / s \rceil",
     parameters=(
-        Parameter(name="strength", unit="DN", low=2.0, high=64.0, default=4.0, source="step; 1-6 bits lost", log=True),
+        Parameter(
+            name="strength",
+            unit="DN",
+            low=2.0,
+            high=64.0,
+            default=4.0,
+            source="step between codes; 1-6 bits lost",
+            log=True,
+        ),
     ),
     stage="readout",
     reference="uniform quantiser: Widrow (1956), doi:10.1109/TCT.1956.1086334",

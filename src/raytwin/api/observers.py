@@ -149,7 +149,7 @@ def observe(
     references: "Dataset | PathLike | None" = None,
     product_material: str | None = None,
     foreign_material: str | None = None,
-    size: str = "contrast",
+    size: str | None = None,
     detector: str | None = None,
     image: str | None = None,
     false_alarm_rate: float | None = None,
@@ -173,7 +173,7 @@ def observe(
         displaces: the shape takes the product's place.
         references: in place of a shape: a dataset of low-noise images, whose objects are looked for (they take the product's place).
         product_material, foreign_material: of the references; None: as `calibrated` was calibrated, else chicken_breast, rib_bone.
-        size: of the references, `contrast` or `size_mm`.
+        size: of the references, `contrast` or `size_mm`; None: that of the calibrated observer, else `contrast`.
         detector: `ideal` (default), `hotelling`, `npw` or `npwe`; image: `residual` (default of a shape), `quotient`, `low`,
             `high` or `both` (default of references, where detector and texture of the product allow it).
         false_alarm_rate: share of images without object that show an alarm; default 0.01.
@@ -225,7 +225,7 @@ def observe(
             references,
             product_material=materials[0],
             foreign_material=materials[1],
-            size=size,
+            size=size or (efficiency.size_name if efficiency is not None else "contrast"),
             detector=observer.detector,
             image=observer.image if efficiency is not None else image,
         )

@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="MATERIAL",
         help="of the references (default rib_bone; of --networks the sweep's, of --calibrated the observer's)",
     )
-    add("--size", default="contrast", choices=("contrast", "size_mm"), help="of the references (default contrast)")
+    add("--size", choices=("contrast", "size_mm"), help="of the references (default: of --calibrated, else contrast)")
     add("--detector", help="ideal (default), hotelling, npw or npwe")
     add(
         "--image",

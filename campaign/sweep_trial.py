@@ -31,7 +31,7 @@ from ._leash import line_from_parent
 from ._plain import canonical, digest, plain, read_object
 from .sweep_file import SIZES, Campaign, CurveOptions, Pair, Training, Trying, text_of_pair
 from .sweep_settings import open_references, start_pair
-from .trial import curve_of_table, detect_on_file, thresholds_from_images, train_on_file, write_split
+from .trial import LOWEST_THRESHOLD, curve_of_table, detect_on_file, thresholds_from_images, train_on_file, write_split
 
 if TYPE_CHECKING:
     from ..generator.datasets.generate import GenerationSummary
@@ -480,6 +480,12 @@ def _trial(task: Task, folder: Path, tell: Tell) -> dict[str, Any]:
         thresholds = thresholds_from_images(
             networks, train, folder / "thresholds.json", trying["marked_share"], device=task["device"]
         )
+        reluctant = sum(value <= LOWEST_THRESHOLD for value in thresholds.values())
+        if reluctant:
+            warnings.append(
+                f"{reluctant} of {len(thresholds)} networks mark fewer images than marked_share = {trying['marked_share']:g} asks"
+                f" for, even at the lowest threshold, {LOWEST_THRESHOLD:g}: they were tried as less ready to mark than others"
+            )
     else:
         thresholds = dict.fromkeys(range(training["networks"]), trying["threshold"])
     detect_on_file(networks, test, hits, {}, thresholds, device=task["device"])

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ..segmentation import EpochResult, Recipe
 
 _FEWEST_TO_TRY = 5  # objects
+LOWEST_THRESHOLD = 0.01  # probability above which pixels are marked: what a network is less sure of it does not see
 _AT_ONCE = 8  # images through a network
 _NEAR_PX = 3  # a mark this close to an object belongs to it
 
@@ -104,7 +105,7 @@ def thresholds_from_images(
     *,
     device: str,
     numbers: Sequence[int] | None = None,
-    lowest: float = 0.01,
+    lowest: float = LOWEST_THRESHOLD,
 ) -> dict[int, float]:
     """Probability above which each network's pixels are marked, by network.
 

@@ -13,17 +13,14 @@ import numpy as np
 
 from ...errors import InputError
 from ..line.line_state import FloatArray, LineContext, LineState
-from ..line.spectral_signal import OpenBeam
+from ..line.spectral_signal import OpenBeam, SpectralModel
+from ..line.twin import Twin
 from ._sheets import Sheets
 from .effect import LIT_SERIES, Effect, Grid, Parameter, Shows, Variation
 
 _UNIT = 0.1  # share of the unfiltered signal that the unit of depth takes
-_DEPTHS = (
-    -1.0,
-    1.0,
-    2.0,
-    4.0,
-)  # of the anodes behind which scenes are projected: exact to 2e-4 of the beam up to 30 % taken
+# of the anodes behind which scenes are projected: exact to 2e-4 of the beam where up to 30 % of it is taken
+_DEPTHS = (-1.0, 1.0, 2.0, 4.0)
 
 
 def _field_coordinate(shape: tuple[int, int], direction_deg: float) -> FloatArray:
@@ -34,17 +31,15 @@ def _field_coordinate(shape: tuple[int, int], direction_deg: float) -> FloatArra
     return np.asarray(row[:, None] * math.cos(angle) + column[None, :] * math.sin(angle), dtype=np.float64)
 
 
-def _path_mm(context: LineContext, parameters: FloatArray, kV: float) -> float:
+def _path_mm(model: SpectralModel, parameters: FloatArray, kV: float) -> float:
     """Anode (mm) that takes _UNIT of the unfiltered beam's signal at a voltage, to first order."""
-    model = context.model
-    assert model is not None
     bare = model.moment_weights(parameters, OpenBeam(kV=kV, filters=()))[0]
     return _UNIT * float(bare.sum()) / float(bare @ model.mu(model.anode)[: bare.size])
 
 
-def _middle_kV(context: LineContext, kV: float) -> float:
+def _middle_kV(twin: Twin, kV: float) -> float:
     """Middle of the voltages that calibrated the twin; kV where none is known."""
-    known = [level.kV for level in context.twin.levels if level.kV]
+    known = [level.kV for level in twin.levels if level.kV]
     return math.sqrt(min(known) * max(known)) if known else kV
 
 
@@ -63,11 +58,11 @@ def _tilt(state: LineState, parameters: Mapping[str, float], context: LineContex
     if request.setting is None or request.setting.kV is None:
         return state
     kV = request.setting.kV
-    unit_mm = _path_mm(context, state.parameters, kV)
+    unit_mm = _path_mm(model, state.parameters, kV)
     # in units of the path that takes _UNIT at this voltage, from one border of the field to the other
     depth = parameters["strength"] / (100.0 * _UNIT)
     if parameters["fixed_path"] != 0:
-        middle_mm = _path_mm(context, state.parameters, _middle_kV(context, kV))
+        middle_mm = _path_mm(model, state.parameters, _middle_kV(context.twin, kV))
         depth *= (middle_mm / unit_mm) ** parameters["fixed_path"]
     sheets = Sheets(_DEPTHS, unit_mm * model.mu(model.anode)[: context.weights.shape[1]])
     rows = sheets.rows(context.weights)

@@ -109,8 +109,8 @@ def read_pod_table(
     Args:
         source: the file, text with a header line; or a pandas data frame, or column -> values, with a row a trial.
         size: the size's column; None = the first of contrast, size, size_mm, ...
-        hit: the column of hits; several (or comma-separated) = one inspection each; None = `hit` or the like, else all
-            columns after the size that hold nothing but 0 and 1 (mh1823).
+        hit: the column of hits; several (or comma-separated) = one inspection each; None = `hit` or the like, else the
+            inspections of mh1823's layout: two or more columns of 0 and 1, with nothing else but labels after the size.
         trials: the column of the number of trials of a row.
         response: the column of a continuous response; then no hits are read.
         site, network, image: columns of labels; None = `site` (or target), `network`, `image` where they exist.
@@ -370,13 +370,27 @@ def _present(header: list[str], names: Sequence[str]) -> str | None:
 def _default(header: list[str], names: Sequence[str], option: str) -> str:
     found = _present(header, names)
     if found is None:
+        near = _near(names, header)
         raise InputError(
             option,
             received="columns " + ", ".join(header),
             expected="one of " + ", ".join(names),
-            remedy=f"name the column: {option}=... (--{option})",
+            remedy=f"did you mean {near}? name it: {option}={near!r} (--{option} {near})"
+            if near
+            else f"name the column: {option}=... (--{option})",
         )
     return found
+
+
+def _near(names: Sequence[str], header: list[str]) -> str | None:
+    """The column whose name is nearly one of `names`, the nearest of several; None: there is none."""
+    lower = {known.lower(): known for known in header}
+    found = [
+        (difflib.SequenceMatcher(None, name, one).ratio(), one)
+        for name in names
+        for one in difflib.get_close_matches(name, lower, n=1, cutoff=0.65)
+    ]
+    return lower[max(found)[1]] if found else None
 
 
 def _hit_columns(hit: str | Sequence[str] | None, sheet: _Sheet, at_size: int, taken: list[str]) -> list[str]:
@@ -389,14 +403,11 @@ def _hit_columns(hit: str | Sequence[str] | None, sheet: _Sheet, at_size: int, t
     found = _present(header, HIT_NAMES)
     if found is not None:
         return [found]
-    binary = [
-        name
-        for at, name in enumerate(header)
-        if at > at_size and name not in taken and all(row[at].strip() in ("0", "1") for row in sheet.rows)
-    ]
-    if not binary:
-        return [_default(header, HIT_NAMES, "hit")]
-    return binary
+    after = [name for name in header[at_size + 1 :] if name not in taken]
+    # a single column of 0 and 1, or one beside numbers of another kind, may be anything
+    if len(after) > 1 and all(set(sheet.texts(name, range(len(sheet.rows)))) <= {"0", "1"} for name in after):
+        return after
+    return [_default(header, HIT_NAMES, "hit")]
 
 
 def _melted(sheet: _Sheet, hits: list[str]) -> _Sheet:

@@ -74,6 +74,22 @@ def test_mh1823_columns_of_inspections_become_looks(tmp_path):
     assert len(read_pod_table(path, hit=["BL"]).size) == 3
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("size,weight\n1,0\n2,1\n", "hit: got columns size, weight; expected one of hit, hits"),
+        ("size,h\n1,0\n2,1\n", "name the column: hit=... (--hit)"),
+        ("size,weight,flag,angle\n1,0,1,3.5\n2,1,1,7\n", "name the column: hit=... (--hit)"),
+        ("size,hti\n1,0\n2,1\n", "did you mean hti? name it: hit='hti' (--hit hti)"),
+        ("size_mm,Detect\n1,0\n2,1\n", "did you mean Detect? name it: hit='Detect' (--hit Detect)"),
+    ],
+)
+def test_a_column_of_0_and_1_under_another_name_is_no_column_of_hits(tmp_path, text, words):
+    with pytest.raises(InputError) as error:
+        read_pod_table(written(tmp_path, text))
+    assert words in str(error.value)
+
+
 def test_an_inspection_that_did_not_look_is_no_trial(tmp_path):
     table = read_pod_table(written(tmp_path, "ID,size,AL,BL\nt1,0.5,1,\nt2,1.5,1,0\n"), hit="AL,BL")
     assert table.hits.tolist() == [1, 1, 0]

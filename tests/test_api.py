@@ -485,6 +485,10 @@ def closed():
             "bootstrap: got with a response",
         ),
         (
+            lambda: rt.fit_pod({"a": [1, 2, 3], "y": [1, 2, 4]}, response="y", decision=2, link="logit"),
+            "link: got with a response; expected hits and misses, not a continuous response",
+        ),
+        (
             lambda: rt.fit_pod({"a": [1, 2, 3], "y": [1, 2, 4]}, response="y", decision="2"),
             "decision: got '2'; expected a finite response",
         ),

@@ -205,7 +205,7 @@ def fit_pod(
         table: a CSV file, a pandas data frame, column -> values, or what `detect` returned; a row a trial.
         size, hit, trials, site, network, image: names of the columns; None: the usual ones.
         link: `cloglog`, `loglog`, `logit` or `probit`, whose bounds are given. None: `cloglog`; where another fits
-            better, the bounds reach as far as those of all links and scales that fit.
+            better, the bounds reach as far as those of all links and scales that fit. Of hits alone: a response has its own.
         log_size: the curve on the logarithm of the size.
         method: `ml` or `firth`; None: `ml`, and `firth` where hits and misses do not overlap.
         repeats: `crossed`, `scaled`, `cluster` or `pooled`; None: `crossed` where network and image are known, else `pooled`.
@@ -252,6 +252,7 @@ def fit_pod(
         )
     if response is not None or read.response is not None:
         _check_no_word_of_hits(
+            link=link,
             method=method,
             ceiling=ceiling,
             floor=floor,

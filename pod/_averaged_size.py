@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import FitError
 from ._laplace import Laplace
 from .few_groups import Levels, levels_of, size_from_test, student_quantile
 from .links import Link
@@ -28,6 +29,8 @@ from .mixed import Codes, MixedFit, averaged_eta, fit_mixed, minimise, second_di
 from .trials import Trials
 
 Array = NDArray[np.float64]
+
+_NO_MAXIMUM = "the likelihood of the fit with crossed random effects does not fall on all sides of its estimate"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,7 +70,11 @@ class CrossedTrials:
 
 
 class AveragedSize:
-    """The averaged a90 on the scale of x: its estimate, standard error (delta method) and bounds."""
+    """The averaged a90 on the scale of x: its estimate, standard error (delta method) and bounds.
+
+    Raises:
+        FitError: the likelihood does not fall on all sides of the estimate.
+    """
 
     def __init__(self, mixed: MixedFit, trials: CrossedTrials) -> None:
         link = trials.link
@@ -84,14 +91,20 @@ class AveragedSize:
                 for step in np.diag(1e-4 * np.maximum(np.abs(parameters), 1e-2))
             ]
         )
-        self.error = math.sqrt(max(float(rise @ mixed.covariance @ rise), 1e-300))
+        squared = float(rise @ mixed.covariance @ rise)
+        if not squared > 0:
+            raise FitError(_NO_MAXIMUM)
+        self.error = math.sqrt(squared)
         # the free parameters (slope, spreads) in units in which the deviance is round
         covariance = mixed.covariance[1:, 1:].copy()
         zero = np.concatenate(([False], mixed.sd == 0))
         covariance[zero, :] = 0.0
         covariance[:, zero] = 0.0
         covariance[zero, zero] = 0.05
-        self._root = np.linalg.cholesky(covariance)
+        try:
+            self._root = np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError:
+            raise FitError(_NO_MAXIMUM) from None
         self._centre = parameters[1:]
         # a spread at 0 is apart from the others in these units, and held there by r*
         self._kept = ~zero
@@ -184,6 +197,8 @@ class AveragedSize:
                 return None
             if abs(now - z) < 1e-4:
                 return at
+            if at == before:
+                return None  # the search stands still
             rate = (now - root_before) / (at - before)
             if not rate * side > 0:
                 return None

@@ -31,6 +31,7 @@ from .trials import Trials
 Array = NDArray[np.float64]
 
 _NAMES = ("first", "second")  # of the tables, in messages
+_LEAST_EIGENVALUE = 1e-10  # of a matrix of correlations: one below it is rounding, as in `robust.leave_out`
 _MOST_ALIKE = 0.99  # correlation of two a90 that intervals take: 1 would say that the difference is known exactly
 
 
@@ -201,14 +202,20 @@ def _fits_alike(
         return fit_trials(_compressed(table), link=link, log_size=log_size, method=method, repeats=repeats)
 
     fits = tuple(fit_of(table, repeats) for table in tables)
-    notes = [f"{name}: {note}" for name, fit in zip(_NAMES, fits, strict=True) for note in fit.warnings]
+    again: list[str] = []
     if repeats == "crossed" and any(fit.repeats == "cluster" for fit in fits):
-        # a spread without finite estimate in one table: both are treated alike, and so is the test of the curves
+        # no crossed fit of one table: both are treated alike, and so is the test of the curves
         repeats = "cluster"
+        again = [
+            f"{name}: clustered as well (repeats cluster), as the other table has no crossed fit"
+            for name, fit in zip(_NAMES, fits, strict=True)
+            if fit.repeats != "cluster"
+        ]
         fits = tuple(
             fit if fit.repeats == "cluster" else fit_of(table, repeats) for table, fit in zip(tables, fits, strict=True)
         )
-    return fits, repeats, notes
+    notes = [f"{name}: {note}" for name, fit in zip(_NAMES, fits, strict=True) for note in fit.warnings]
+    return fits, repeats, [*again, *notes]
 
 
 def _with_links_open(fits: tuple[PodFit, ...], tables: tuple[Trials, Trials]) -> tuple[tuple[PodFit, ...], list[str]]:
@@ -462,9 +469,9 @@ def _robust_test(
     change = np.array([(fits[1].c0 or 0.0) - (fits[0].c0 or 0.0), (fits[1].c1 or 0.0) - (fits[0].c1 or 0.0)])
     statistics = []
     for groups in [[one] for one in codes] + ([codes] if len(codes) > 1 else []):
-        covariance = clustered_meat(rows, rows, groups)
-        if np.linalg.eigvalsh(covariance).min() > 0:
-            statistics.append(float(change @ np.linalg.solve(covariance, change)))
+        statistic = _distance(change, clustered_meat(rows, rows, groups))
+        if statistic is not None:
+            statistics.append(statistic)
     if not statistics:
         return None
     fewest = min(int(one.max()) + 1 for one in codes)
@@ -480,6 +487,23 @@ def _robust_test(
         p=float(fdtrc(2, degrees, value)),
         kind=f"Hotelling, robust to networks and images ({fewest} clusters)",
     )
+
+
+def _distance(change: Array, covariance: Array) -> float | None:
+    """change' covariance^-1 change, 0 where nothing changed; None where the covariance has no inverse.
+
+    Networks that all agree differ in nothing, and have a covariance of rounding.
+    """
+    if not change.any():
+        return 0.0
+    scale = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    if not np.all(scale > 0):
+        return None
+    alike = covariance / np.outer(scale, scale)
+    if not np.linalg.eigvalsh(alike).min() > _LEAST_EIGENVALUE:
+        return None
+    moved = change / scale
+    return float(moved @ np.linalg.solve(alike, moved))
 
 
 def _inflation(fit: PodFit) -> float:

@@ -77,6 +77,7 @@ def fit_crossed(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
 
     Raises:
         InputError: neither network nor image is known, or `method` asks for bias reduction.
+        FitError: the search did not converge, or it ended where the likelihood has no maximum.
     """
     if table.network is None and table.image is None:
         raise InputError(

@@ -18,6 +18,7 @@ from ._laplace import Laplace
 from .links import Link
 
 Array = NDArray[np.float64]
+_NOT_CONVERGED = "the fit with crossed random effects did not converge"
 _SLOW = 15  # steps that most minima take less than
 Codes = NDArray[np.intp]
 
@@ -124,7 +125,11 @@ def fit_mixed(
         begin[:width] = start * scale
         begin[0] += start[1:] @ centre[1:]
     begin[width:] = 0.7
-    best, value, hessian, converged = minimise(deviance, begin)
+    try:
+        best, value, hessian, converged = minimise(deviance, begin)
+    except np.linalg.LinAlgError:
+        # the search ran to where a spread is endless and the curvature at the mode is lost in rounding
+        raise FitError(_NOT_CONVERGED) from None
     sd = np.abs(best[width:])
     zero = sd < _ZERO_SD
     if zero.any():
@@ -138,7 +143,7 @@ def fit_mixed(
     else:
         covariance = 2 * _inverse(hessian)
     if not converged:
-        raise FitError("the fit with crossed random effects did not converge; use --repeats cluster")
+        raise FitError(_NOT_CONVERGED)
     back = np.eye(len(best))
     back[:width, :width] = np.diag(1.0 / scale)
     back[0, 1:width] = -centre[1:] / scale[1:]
@@ -163,9 +168,7 @@ def _inverse(hessian: Array) -> Array:
     try:
         return np.asarray(np.linalg.inv(hessian), dtype=np.float64)
     except np.linalg.LinAlgError:
-        raise FitError(
-            "the data do not fix the spread between networks and images (the likelihood is flat); use --repeats cluster"
-        ) from None
+        raise FitError("the data do not fix the spread between networks and images (the likelihood is flat)") from None
 
 
 def _filled(whole: Array, free: NDArray[np.bool_], part: Array) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import InputError
+from ..errors import FitError, InputError
 from .crossed import ONE_NETWORK, SEPARATED, fit_crossed, without_bounds
 from .hit_miss import METHODS, PodFit, fit_pooled, sizes_from_curve
 from .links import Link, link_from_name
@@ -33,7 +33,7 @@ def fit_scaled(table: Trials, *, link: Link, log_size: bool, method: str) -> Pod
             "repeats scaled",
             received="no column of sites",
             expected="the site (or image) of each trial",
-            remedy="name its column with --site",
+            remedy="name its column: site=... (--site)",
         )
     sites = int(site.max()) + 1
     inspections = table.n / sites
@@ -64,7 +64,7 @@ def fit_cluster(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
             "repeats cluster",
             received="no column of networks, images or sites",
             expected="at least one of them",
-            remedy="name the site's column with --site, or use --repeats pooled",
+            remedy="name the site's column: site=... (--site), or use repeats='pooled' (--repeats pooled)",
         )
     naive = fit_pooled(table, link=link, log_size=log_size, method=method)
     if naive.curve is None:
@@ -102,7 +102,7 @@ def fit_cluster(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
 
 
 def fit_crossed_where_finite(table: Trials, *, link: Link, log_size: bool, method: str) -> PodFit:
-    """Crossed random effects; where a spread has no finite estimate, the clustered curve instead, and said so.
+    """Crossed random effects; the clustered curve, and said so, where they do not converge or a spread has no finite estimate.
 
     When every network hits or misses the same images, the likelihood rises with the images' spread without end. The
     averaged curve is then that of the assumed Gaussian's far tails rather than of the data, and its a90 lies far beyond the
@@ -110,25 +110,24 @@ def fit_crossed_where_finite(table: Trials, *, link: Link, log_size: bool, metho
 
     Raises:
         InputError: neither network nor image is known.
-        FitError: the search did not converge.
+        FitError: the pooled curve has no fit either.
     """
-    fit = fit_crossed(table, link=link, log_size=log_size, method=method)
-    if fit.crossed is None:
-        return fit
-    spreads = {"network": fit.crossed.sd_network, "image": fit.crossed.sd_image}
-    endless = [name for name, sd in spreads.items() if sd is not None and sd > LARGEST_SD]
-    if not endless:
-        return fit
+    try:
+        fit = fit_crossed(table, link=link, log_size=log_size, method=method)
+    except FitError as error:
+        why = str(error)
+    else:
+        if fit.crossed is None:
+            return fit
+        spreads = {"network": fit.crossed.sd_network, "image": fit.crossed.sd_image}
+        endless = [name for name, sd in spreads.items() if sd is not None and sd > LARGEST_SD]
+        if not endless:
+            return fit
+        which = " and ".join(f"{name}s" for name in endless)
+        why = f"the spread between {which} has no finite estimate ({which} are all hits or all misses)"
     clustered = fit_cluster(table, link=link, log_size=log_size, method=method)
-    which = " and ".join(f"{name}s" for name in endless)
-    return replace(
-        clustered,
-        warnings=(
-            f"the spread between {which} has no finite estimate ({which} are all hits or all misses): curve and bounds are the"
-            " clustered ones (repeats cluster)",
-            *clustered.warnings,
-        ),
-    )
+    told = f"{why}: curve and bounds are the clustered ones (repeats cluster)"
+    return replace(clustered, warnings=(told, *clustered.warnings))
 
 
 REPEATS: dict[str, Callable[..., PodFit]] = {

@@ -277,7 +277,7 @@ def test_separated_repeats_give_the_bias_reduced_curve_without_bounds():
 
 
 def test_bias_reduction_with_random_effects_is_refused_with_a_way_out():
-    with pytest.raises(InputError, match="use --repeats cluster"):
+    with pytest.raises(InputError, match="--repeats cluster"):
         fit_pod(**crossed_data(1), repeats="crossed", method="firth")
 
 
@@ -432,6 +432,20 @@ def test_images_that_every_network_hits_or_misses_get_the_clustered_curve() -> N
     assert fit.a90 == pytest.approx(once.a90, rel=1e-6)
     assert fit.a90_95.wald is not None and once.a90_95.wald is not None
     assert fit.a90_95.wald >= 0.9 * once.a90_95.wald
+
+
+def test_a_crossed_fit_that_does_not_converge_gives_the_clustered_curve_with_its_reason(monkeypatch) -> None:
+    def fails(*_, **__):
+        raise FitError("the fit with crossed random effects did not converge")
+
+    monkeypatch.setattr("raytwin.pod.repeats.fit_crossed", fails)
+    data = crossed_data(2)
+    fit = fit_pod(**data, repeats="crossed")
+    clustered = fit_pod(**data, repeats="cluster")
+    assert (fit.repeats, fit.a90, fit.a90_95) == ("cluster", clustered.a90, clustered.a90_95)
+    assert fit.warnings[0] == (
+        "the fit with crossed random effects did not converge: curve and bounds are the clustered ones (repeats cluster)"
+    )
 
 
 def test_no_bounds_are_sought_along_a_likelihood_that_rises_without_end(monkeypatch) -> None:

@@ -1,8 +1,9 @@
 """Are two POD curves the same? Real against generated, before against after.
 
 difference = a90_second - a90_first, ratio = a90_second / a90_first, both with 95 % intervals built from the two
-curves' own likelihood intervals (MOVER), with their correlation where the two share images or networks. Few networks enter
-by Student's quantile, in intervals and tests. Verdict at a stated margin on the ratio by two one-sided tests: equivalent
+curves' own likelihood intervals (MOVER), with their correlation where the two share images or networks. There they are at least
+as long as Student's interval of the jackknifed difference (`paired_spread.py`). Few networks enter by Student's quantile, in
+intervals and tests. Verdict at a stated margin on the ratio by two one-sided tests: equivalent
 when the 90 % interval of the ratio lies within [1 / (1 + m), 1 + m]; and, where a margin in the sizes' unit is stated, when the
 90 % interval of the difference lies within [-m, m].
 Source: Zou & Donner, Stat. Med. 27 (2008) 1693, doi:10.1002/sim.3095; Schuirmann, J. Pharmacokin. Biopharm. 15 (1987)
@@ -23,8 +24,9 @@ from .likelihood import Curve
 from .links import LINKS
 from .mixed import fit_mixed
 from .models import compare_models, with_links_open
+from .paired_spread import DifferenceSpread, difference_spread
 from .repeats import fit_trials
-from .robust import bread, clustered_curve, clustered_meat, clustered_total, score_rows
+from .robust import bread, clustered_meat, clustered_total, score_rows
 from .solver import fit_batch
 from .trials import Trials
 
@@ -141,16 +143,18 @@ def compare_pod(
         fits, told = _with_links_open(fits, tables)
         notes += told
     pairs = [word for word, given in (("image", shared_images), ("network", shared_networks)) if given]
-    correlation, at_bound = 0.0, False
-    if pairs and all(fit.curve is not None and fit.c1 is not None and fit.c1 > 0 for fit in fits):
-        correlation, at_bound = _correlation(first, second, fits, log_size=log_size, shared=pairs, repeats=repeats)
+    correlation, spread = _shared_luck(first, second, fits, log_size=log_size, shared=pairs, repeats=repeats)
+    # rounding may ask for a little more than 1
+    at_bound = correlation > 1.0 + 1e-9
+    # what is shared moves both alike; an estimate below 0 is noise of few images or networks
+    correlation = min(max(correlation, 0.0), _MOST_ALIKE)
     if at_bound:
         # what the two share narrows the interval: without it, it is as wide as it can be
         correlation = 0.0
         notes.append(
             "the difference spreads less than any correlation of the two a90 allows: its interval is that of a90 that share nothing"
         )
-    sizes = _compare_a90(fits, margin=margin, correlation=correlation)
+    sizes = _compare_a90(fits, margin=margin, correlation=correlation, spread=spread)
     notes += sizes.notes
     test = None
     if all(fit.curve is not None and not fit.separated for fit in fits):
@@ -179,7 +183,7 @@ def compare_pod(
         correlation_at_bound=at_bound,
         size_equivalence=None
         if size_margin is None
-        else _size_equivalence(fits, sizes.difference, margin=size_margin, correlation=correlation),
+        else _size_equivalence(fits, sizes.difference, margin=size_margin, correlation=correlation, spread=spread),
     )
 
 
@@ -238,21 +242,29 @@ class _ComparedSizes:
     notes: tuple[str, ...] = ()
 
 
-def _compare_a90(fits: tuple[PodFit, ...], *, margin: float, correlation: float) -> _ComparedSizes:
-    """The two a90 compared; `margin` is on their ratio."""
+def _compare_a90(
+    fits: tuple[PodFit, ...], *, margin: float, correlation: float, spread: DifferenceSpread | None
+) -> _ComparedSizes:
+    """The two a90 compared; `margin` is on their ratio, `spread` of what they share."""
     a, b = fits[0].a90, fits[1].a90
     if a is None or b is None:
         return _ComparedSizes(notes=("one of the curves has no a90: nothing to compare there",))
-    difference = _mover(b, a, *_ends(fits[1], 1.0), *_ends(fits[0], 1.0), correlation)
+    difference = _at_least(
+        _mover(b, a, *_ends(fits[1], 1.0), *_ends(fits[0], 1.0), correlation), _reach(spread, TWO_SIDED, of_log=False)
+    )
     if a <= 0 or b <= 0:
         told = "sizes are not all above 0 (a log scale?): no ratio and no equivalence test"
         return _ComparedSizes(difference=difference, notes=(told,))
     middle = math.log(b / a)
-    logs = _mover(math.log(b), math.log(a), *_log_ends(fits[1], 1.0), *_log_ends(fits[0], 1.0), correlation)
+    logs = _at_least(
+        _mover(math.log(b), math.log(a), *_log_ends(fits[1], 1.0), *_log_ends(fits[0], 1.0), correlation),
+        _reach(spread, TWO_SIDED, of_log=True),
+    )
     ratio = Interval(value=b / a, low=_exp(logs.low), high=_exp(logs.high))
     shares = _arms_of_90(fits)
-    short = _mover(
-        math.log(b), math.log(a), *_log_ends(fits[1], shares[1]), *_log_ends(fits[0], shares[0]), correlation
+    short = _at_least(
+        _mover(math.log(b), math.log(a), *_log_ends(fits[1], shares[1]), *_log_ends(fits[0], shares[0]), correlation),
+        _reach(spread, ONE_SIDED, of_log=True),
     )
     low90, high90 = _exp(short.low), _exp(short.high)
     edge = math.log1p(margin)
@@ -263,7 +275,9 @@ def _compare_a90(fits: tuple[PodFit, ...], *, margin: float, correlation: float)
         ratio=ratio,
         low90=low90,
         high90=high90,
-        p=_p_equivalence(middle, logs, edge, min(_freedoms(fits))),
+        p=_p_equivalence(
+            middle, logs, edge, min([*_freedoms(fits), math.inf if spread is None else spread.degrees_of_freedom])
+        ),
         verdict=_verdict(inside=inside, apart=apart),
     )
 
@@ -283,14 +297,22 @@ def _arms_of_90(fits: tuple[PodFit, ...]) -> list[float]:
 
 
 def _size_equivalence(
-    fits: tuple[PodFit, ...], difference: Interval, *, margin: float, correlation: float
+    fits: tuple[PodFit, ...],
+    difference: Interval,
+    *,
+    margin: float,
+    correlation: float,
+    spread: DifferenceSpread | None,
 ) -> SizeEquivalence:
     """Verdict on the difference of the two a90."""
     a, b = fits[0].a90, fits[1].a90
     if a is None or b is None:
         return SizeEquivalence(margin=margin, low=None, high=None, verdict="inconclusive")
     shares = _arms_of_90(fits)
-    short = _mover(b, a, *_ends(fits[1], shares[1]), *_ends(fits[0], shares[0]), correlation)
+    short = _at_least(
+        _mover(b, a, *_ends(fits[1], shares[1]), *_ends(fits[0], shares[0]), correlation),
+        _reach(spread, ONE_SIDED, of_log=False),
+    )
     inside = short.low is not None and short.high is not None and short.low > -margin and short.high < margin
     apart = (difference.low is not None and difference.low > 0) or (difference.high is not None and difference.high < 0)
     return SizeEquivalence(margin=margin, low=short.low, high=short.high, verdict=_verdict(inside=inside, apart=apart))
@@ -344,6 +366,25 @@ def _mover(
     return Interval(value=b - a, low=low, high=high)
 
 
+def _reach(spread: DifferenceSpread | None, below: float, *, of_log: bool) -> float:
+    """Half of Student's interval of the jackknifed difference, or of the log of the ratio; 0 where there is none."""
+    if spread is None:
+        return 0.0
+    sd = spread.sd_of_log if of_log else spread.sd
+    return float(student_quantile(below, spread.degrees_of_freedom)) * sd if math.isfinite(sd) else 0.0
+
+
+def _at_least(interval: Interval, reach: float) -> Interval:
+    """The interval, both arms stretched alike to twice `reach` where it is shorter."""
+    if interval.value is None or interval.low is None or interval.high is None:
+        return interval
+    below, above = interval.value - interval.low, interval.high - interval.value
+    if not 0 < below + above < 2 * reach:
+        return interval
+    stretch = 2 * reach / (below + above)
+    return replace(interval, low=interval.value - stretch * below, high=interval.value + stretch * above)
+
+
 def _p_equivalence(middle: float, logs: Interval, edge: float, freedom: float) -> float | None:
     """The larger p of the two one-sided tests of |ln ratio| >= edge, each with the spread of its own side."""
     from scipy.special import ndtr, stdtr
@@ -358,46 +399,52 @@ def _p_equivalence(middle: float, logs: Interval, edge: float, freedom: float) -
     return max(float(stdtr(freedom, one) if math.isfinite(freedom) else ndtr(one)) for one in deviations)
 
 
-def _correlation(
+def _shared_luck(
     first: Trials, second: Trials, fits: tuple[PodFit, ...], *, log_size: bool, shared: list[str], repeats: str
-) -> tuple[float, bool]:
-    """Correlation of the two a90 from what they share, and whether the spreads ask for one above 1.
+) -> tuple[float, DifferenceSpread | None]:
+    """Correlation of the two a90 from what they share, as estimated, and the spread of their difference; 0 and None: nothing.
 
-    By the clustered spread of their difference, as pooled curves.
+    Both are of the pooled curves. Where looks are taken as independent, only a look at the same image by the same network pairs.
+    """
+    curves = [fit.curve for fit in fits if fit.curve is not None and fit.c1 is not None and fit.c1 > 0]
+    if (
+        not shared
+        or len(curves) < 2
+        or any(fit.separated or not curve.coefficients[1] > 0 for fit, curve in zip(fits, curves, strict=True))
+    ):
+        return 0.0, None
+    if repeats == "pooled":
+        return _correlation_of_looks(first, second, curves, log_size=log_size, shared=shared), None
+    spread = difference_spread((first, second), curves, shared=shared, log_size=log_size)
+    return (0.0, None) if spread is None else (spread.correlation, spread)
+
+
+def _correlation_of_looks(
+    first: Trials, second: Trials, curves: list[Curve], *, log_size: bool, shared: list[str]
+) -> float:
+    """Correlation of the two a90 where looks are independent, but for those at the same image by the same network.
 
     Each look adds to a90 what its score says; summed over both tables with opposite signs these make the difference.
-    Its variance is clustered by network and image (`robust.clustered_total`). The correlation is the one with which the
-    interval of the difference is as wide as Student's quantile times that standard error, each at its degrees of freedom.
     """
-    influences, arms = [], []
-    apart = repeats == "pooled"  # looks taken as independent: only a look at the same image by the same network pairs
-    for table, fit, sign in zip((first, second), fits, (-1.0, 1.0), strict=True):
-        curve = fit.curve
-        if curve is None:
-            return 0.0, False
+    influences, errors = [], []
+    for table, curve, sign in zip((first, second), curves, (-1.0, 1.0), strict=True):
         x90 = (curve.link.eta_from_pod(0.9) - curve.coefficients[0]) / curve.coefficients[1]
         gradient = -np.array([1.0, x90]) / curve.coefficients[1]
-        groups = [codes for codes in (table.network, table.image) if codes is not None and codes.max() > 0]
-        variance, freedom = np.asarray(gradient @ curve.covariance @ gradient), np.array(np.inf)
-        if groups and not apart:
-            clustered = clustered_curve(table, curve, groups=groups, log_size=log_size)
-            if clustered is None:
-                return 0.0, False
-            variance, freedom = clustered.variance(gradient)
-        arms.append(math.sqrt(float(variance)) * float(student_quantile(TWO_SIDED, freedom)))
+        errors.append(math.sqrt(float(gradient @ curve.covariance @ gradient)))
         scores = score_rows(table, curve, log_size=log_size)
         influences.append(sign * scores @ bread(table, curve, log_size=log_size) @ gradient)
     both = _stacked(first, second, shared)
     codes = [one for one in (both.network, both.image) if one is not None]
-    if not codes or not all(arm > 0 for arm in arms):
-        return 0.0, False
-    if apart and len(codes) > 1:
-        codes = [np.unique(codes[0] * (int(codes[1].max()) + 1) + codes[1], return_inverse=True)[1].astype(np.intp)]
-    of_difference, its_freedom = clustered_total(np.concatenate(influences), codes)
-    arm = math.sqrt(of_difference) * float(student_quantile(TWO_SIDED, its_freedom))
-    value = (arms[0] ** 2 + arms[1] ** 2 - arm**2) / (2 * arms[0] * arms[1])
-    # what is shared moves both alike; an estimate below 0 is noise of few images or networks
-    return min(max(value, 0.0), _MOST_ALIKE), value > 1.0 + 1e-9
+    if not codes or not all(error > 0 for error in errors):
+        return 0.0
+    looks = np.unique(np.stack(codes, axis=1), axis=0, return_inverse=True)[1].ravel().astype(np.intp)
+    of_difference, freedom = clustered_total(np.concatenate(influences), [looks])
+    arm = (
+        math.sqrt(of_difference)
+        * float(student_quantile(TWO_SIDED, freedom))
+        / float(student_quantile(TWO_SIDED, math.inf))
+    )
+    return (errors[0] ** 2 + errors[1] ** 2 - arm**2) / (2 * errors[0] * errors[1])
 
 
 def _curve_test(
@@ -419,7 +466,9 @@ def _curve_test(
     small = np.stack((np.ones_like(x), centred), axis=1)
     large = np.stack((np.ones_like(x), centred, group, group * centred), axis=1)
     if repeats == "crossed":
-        factors, _, _ = usable_factors(both)
+        # what the noise of one table does to an image is shared by its networks, and not by the other table: an image of each
+        # table has an effect of its own (what both tables have in common only makes the test say less)
+        factors, _, _ = usable_factors(_stacked(first, second, [name for name in shared if name != "image"]))
         if factors:
             try:
                 values = [

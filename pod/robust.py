@@ -24,6 +24,15 @@ def score_rows(table: Trials, curve: Curve, *, log_size: bool) -> Array:
     return np.asarray(np.stack((first, first * x), axis=1))
 
 
+def information_rows(table: Trials, curve: Curve, *, log_size: bool) -> Array:
+    """Contribution of each row to the expected information on (c0, c1), (row, 2, 2)."""
+    x = np.log(table.size) if log_size else table.size
+    parts = curve.link.log_parts(curve.coefficients[0] + curve.coefficients[1] * x)
+    weight = -(table.hits + table.misses) * parts.log_hit_1 * parts.log_miss_1
+    design = np.stack((np.ones_like(x), x), axis=1)
+    return np.asarray(weight[:, None, None] * design[:, :, None] * design[:, None, :])
+
+
 def bread(table: Trials, curve: Curve, *, log_size: bool) -> Array:
     """Inverse of the observed information of (c0, c1), (2, 2)."""
     x = np.log(table.size) if log_size else table.size
@@ -182,11 +191,7 @@ def clustered_curve(table: Trials, curve: Curve, *, groups: list[NDArray[np.intp
         groups: one array of codes (row,) a way of clustering.
         log_size: whether the curve is on ln size.
     """
-    x = np.log(table.size) if log_size else table.size
-    parts = curve.link.log_parts(curve.coefficients[0] + curve.coefficients[1] * x)
-    weight = -(table.hits + table.misses) * parts.log_hit_1 * parts.log_miss_1
-    design = np.stack((np.ones_like(x), x), axis=1)
-    information = weight[:, None, None] * design[:, :, None] * design[:, None, :]
+    information = information_rows(table, curve, log_size=log_size)
     return clustered_fit(score_rows(table, curve, log_size=log_size), information, groups)
 
 

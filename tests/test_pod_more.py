@@ -368,7 +368,7 @@ def test_spreads_that_no_correlation_explains_are_said(monkeypatch):
     words = {"link": "logit", "repeats": "cluster", "shared_images": True, "shared_networks": True}
     plain = compare_pod(one, two, **words)
     assert not plain.correlation_at_bound and plain.correlation > 0.0
-    monkeypatch.setattr("raytwin.pod.comparison._correlation", lambda *tables, **options: (0.99, True))
+    monkeypatch.setattr("raytwin.pod.comparison._shared_luck", lambda *tables, **options: (1.2, None))
     found = compare_pod(one, two, **words)
     assert found.correlation_at_bound
     # as wide as where nothing is shared

@@ -25,6 +25,7 @@ def trials_from_table(table: PodTable, *, log_size: bool) -> Trials:
         image=table.image,
         site=table.site,
         log_size=log_size,
+        places=table.places,
     )
 
 
@@ -33,14 +34,16 @@ def notes_on_table(table: PodTable, repeats: str) -> list[str]:
     notes = list(table.notes)
     settings = set(table.other.get("setting", ()))
     if len(settings) > 1:
-        notes.append(f"{len(settings)} settings in one curve; choose one with --where setting=...")
+        notes.append(
+            f"{len(settings)} settings in one curve; choose one with where={'setting': ...} (--where setting=...)"
+        )
     if repeats == "pooled":
         for name in ("site", "image", "network"):
             labels = getattr(table, name)
             if labels is not None and 1 < len(set(labels)) < len(labels):
                 notes.append(
-                    f"{len(labels)} trials of {len(set(labels))} {name}s taken as independent: repeats need --repeats"
-                    " scaled, cluster or crossed"
+                    f"{len(labels)} trials of {len(set(labels))} {name}s taken as independent: repeats need"
+                    " repeats='scaled', 'cluster' or 'crossed' (--repeats)"
                 )
                 break
     return notes

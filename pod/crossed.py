@@ -84,14 +84,14 @@ def fit_crossed(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
             "repeats crossed",
             received="no column of networks or images",
             expected="at least one of them",
-            remedy="use --repeats pooled where each trial is independent",
+            remedy="use repeats='pooled' (--repeats pooled) where each trial is independent",
         )
     if method == "firth":
         raise InputError(
             "method firth",
             received="with repeats crossed",
             expected="maximum likelihood where there are random effects",
-            remedy="use --repeats cluster with --method firth",
+            remedy="use repeats='cluster' (--repeats cluster) with method firth",
         )
     naive = fit_pooled(table, link=link, log_size=log_size, method=method)
     factors, names, notes = usable_factors(table)

@@ -133,12 +133,6 @@ def fit_pooled(table: Trials, *, link: Link, log_size: bool, method: str, diviso
     used = method
     if method == "auto":
         used = "firth" if separated and 0 < table.n_hits < table.n and len(x) > 1 else "ml"
-        if used == "firth":
-            notes.append(
-                "hits and misses do not overlap in size (the data separate): no most likely curve exists; the curve is"
-                " Firth's bias-reduced one, with Wald's upper bounds on a90 and no lower ones; sizes with more overlap would"
-                " say more"
-            )
     common: dict[str, Any] = {
         "link": link.name,
         "method": used,
@@ -169,7 +163,8 @@ def fit_pooled(table: Trials, *, link: Link, log_size: bool, method: str, diviso
     else:
         batch = fit_batch(design, hits[None], misses[None], link=link, bias_reduced=True)
         if not batch.converged[0]:
-            return empty("the bias-reduced fit did not converge")
+            why = "hits and misses do not overlap in size, and " if separated else ""
+            return empty(f"{why}the bias-reduced fit did not converge")
         coefficients = batch.coefficients[0]
     eta = design @ coefficients
     parts = link.log_parts(eta)
@@ -195,6 +190,12 @@ def fit_pooled(table: Trials, *, link: Link, log_size: bool, method: str, diviso
         at_maximum=used == "ml",
     )
     sizes = sizes_from_curve(curve, table=table, log_size=log_size, separated=separated)
+    if method == "auto" and used == "firth":
+        told = "hits and misses do not overlap in size (the data separate): no most likely curve exists; "
+        told += "the curve is Firth's bias-reduced one"
+        if sizes.a90 is not None:
+            told += ", with Wald's upper bounds on a90 and no lower ones"
+        notes.append(told + "; sizes with more overlap would say more")
     return PodFit(
         **common,
         c0=curve.coefficients[0],

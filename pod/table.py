@@ -59,7 +59,8 @@ class PodTable(ByValue):
     size (row,) in the column's own unit, or None; hits (row,), trials (row,) or None; response (row,) or None;
     other: every remaining column as text, for the rows with an object. false_alarm (product,): 1 where a product
     without object was marked; its labels beside it; noise_response: their
-    responses. notes: what was read in another way than one might think.
+    responses. notes: what was read in another way than one might think. places: what messages call each row with an object, `line 3`
+    of a file or `row 3` of columns in memory.
     """
 
     size_name: str
@@ -76,6 +77,7 @@ class PodTable(ByValue):
     false_alarm_image: tuple[str, ...] | None = None
     noise_response: Array = field(default_factory=lambda: np.zeros(0))
     notes: tuple[str, ...] = ()
+    places: tuple[str, ...] = ()
 
     def numbers(self, name: str) -> Array:
         """A column of the table as numbers (row,).
@@ -88,7 +90,7 @@ class PodTable(ByValue):
         column = _chosen(name, list(self.other), "covariate or explaining column")
         values = np.empty(len(self.size))
         for row, text in enumerate(self.other[column]):
-            values[row] = _number(text, column, f"row {row + 1}")
+            values[row] = _number(text, column, self.places[row] if self.places else f"row {row + 1}")
         return values
 
 
@@ -118,7 +120,8 @@ def read_pod_table(
 
     Raises:
         FileFormatError: no such file, not text, no header, a row with another number of columns.
-        InputError: a column is missing or holds something that cannot be used; the message gives the line.
+        InputError: a column is missing or holds something that cannot be used; the message gives the line of a file, or the row
+            of columns in memory.
     """
     sheet = _sheet_of(source)
     if where:
@@ -176,16 +179,17 @@ def read_pod_table(
         false_alarm_image=sheet.texts(labels["image"], without) if labels["image"] and len(alarms) else None,
         noise_response=noise,
         notes=tuple(notes),
+        places=tuple(sheet.places[number] for number in with_object),
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Sheet:
-    """A table as it stands in a file: names of columns, rows of texts, and the number of the line of each row."""
+    """A table as it stands in a file: names of columns, rows of texts, and what each row is called in a message."""
 
     header: list[str]
     rows: list[list[str]]
-    lines: list[int]
+    places: list[str]
 
     def texts(self, name: str, chosen: Sequence[int]) -> tuple[str, ...]:
         """A column of the rows chosen."""
@@ -206,9 +210,7 @@ class _Sheet:
         return [number for number, text in zip(chosen, self.texts(name, chosen), strict=True) if text != ""]
 
     def _told(self, name: str, chosen: Sequence[int]) -> list[tuple[str, str]]:
-        return [
-            (text, f"line {self.lines[number]}") for number, text in zip(chosen, self.texts(name, chosen), strict=True)
-        ]
+        return [(text, self.places[number]) for number, text in zip(chosen, self.texts(name, chosen), strict=True)]
 
 
 def _label_column(role: str, name: str | None, header: list[str], usual: Sequence[str]) -> str | None:
@@ -262,7 +264,7 @@ def _sheet_of(source: Any) -> _Sheet:
     if len(set(header)) != len(header) or "" in header:
         raise InputError("table", received=", ".join(header), expected="distinct, non-empty column names")
     rows = [list(row) for row in zip(*columns, strict=True)]
-    return _Sheet(header=header, rows=rows, lines=list(range(1, len(rows) + 1)))
+    return _Sheet(header=header, rows=rows, places=[f"row {number}" for number in range(1, len(rows) + 1)])
 
 
 def _cell_text(value: Any) -> str:
@@ -319,7 +321,7 @@ def _read_sheet(path: Path) -> _Sheet:
     if separator != ",":
         body = with_decimal_points(header, body, lines=numbers, argument=f"table {path}")
     rows = [["" if cell.strip() in _MISSING else cell for cell in row] for row in body]
-    return _Sheet(header=header, rows=rows, lines=numbers)
+    return _Sheet(header=header, rows=rows, places=[f"line {number}" for number in numbers])
 
 
 def _is_number(text: str) -> bool:
@@ -341,7 +343,7 @@ def _filtered(sheet: _Sheet, where: Mapping[str, str]) -> _Sheet:
         kept = [i for i in kept if rows[i][at].strip() == value]
         if not kept:
             raise InputError("where", received=f"{name}={value}", expected=f"one of {', '.join(known[:12])}")
-    return replace(sheet, rows=[rows[i] for i in kept], lines=[sheet.lines[i] for i in kept])
+    return replace(sheet, rows=[rows[i] for i in kept], places=[sheet.places[i] for i in kept])
 
 
 def _chosen(name: str, header: list[str], option: str) -> str:
@@ -415,15 +417,15 @@ def _melted(sheet: _Sheet, hits: list[str]) -> _Sheet:
     keep = [at for at, name in enumerate(sheet.header) if name not in hits]
     place = [(name, sheet.header.index(name)) for name in hits]
     melted: list[list[str]] = []
-    numbers: list[int] = []
-    for order, (row, line) in enumerate(zip(sheet.rows, sheet.lines, strict=True)):
+    places: list[str] = []
+    for order, (row, its_place) in enumerate(zip(sheet.rows, sheet.places, strict=True)):
         for name, at in place:
             if row[at].strip() == "":
                 continue  # this inspector did not look at this site
             melted.append([*(row[k] for k in keep), str(order), name, row[at]])
-            numbers.append(line)
+            places.append(its_place)
     header = [*(sheet.header[k] for k in keep), _MELTED_ROW, _MELTED_INSPECTION, _MELTED_HIT]
-    return _Sheet(header=header, rows=melted, lines=numbers)
+    return _Sheet(header=header, rows=melted, places=places)
 
 
 def _number(text: str, name: str, place: str) -> float:
@@ -449,6 +451,8 @@ def _hit(text: str, name: str, place: str) -> float:
             f"column {name}, {place}",
             received=repr(text),
             expected="0 (miss) or 1 (hit)",
-            remedy="counts of hits need --trials, a continuous response --response" if math.isfinite(value) else "",
+            remedy="counts of hits need trials=... (--trials), a continuous response response=... (--response)"
+            if math.isfinite(value)
+            else "",
         )
     return value

@@ -1,5 +1,6 @@
 """Trials: sizes with hits and misses, checked once and grouped by size. What every hit/miss fit starts from."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,6 +47,7 @@ def check_trials(
     image: ArrayLike | None = None,
     site: ArrayLike | None = None,
     log_size: bool = False,
+    places: Sequence[str] = (),
 ) -> Trials:
     """Trials from columns, or an error that names the column at fault.
 
@@ -55,13 +57,18 @@ def check_trials(
         trials: (row,), whole numbers of 1 or more; None = one trial a row.
         network, image, site: (row,), labels of any type.
         log_size: whether the fit will take the logarithm of the size.
+        places: what each row is called in a message; empty: `row 1`, `row 2`, ...
 
     Raises:
         InputError: shapes differ, a value is missing or outside its range, or there are no rows.
     """
-    x = _numbers("size", size)
-    hit = _numbers("hit", hits)
-    total = np.ones(len(x)) if trials is None else _numbers("trials", trials)
+
+    def place(row: int) -> str:
+        return places[row] if places else f"row {row + 1}"
+
+    x = _numbers("size", size, place)
+    hit = _numbers("hit", hits, place)
+    total = np.ones(len(x)) if trials is None else _numbers("trials", trials, place)
     if not len(x):
         raise InputError("size", received="no rows", expected="at least two trials with a size")
     for name, column in (("hit", hit), ("trials", total)):
@@ -71,7 +78,7 @@ def check_trials(
         row = int(np.flatnonzero(~(x > 0))[0])
         raise InputError(
             "size",
-            received=f"{x[row]:g} in row {row + 1}",
+            received=f"{x[row]:g} in {place(row)}",
             expected="sizes above 0 where the curve is on log size",
             remedy="fit on the size itself",
         )
@@ -79,18 +86,18 @@ def check_trials(
         wrong = ~np.isin(hit, (0.0, 1.0))
         if wrong.any():
             row = int(np.flatnonzero(wrong)[0])
-            raise InputError("hit", received=f"{hit[row]:g} in row {row + 1}", expected="0 (miss) or 1 (hit)")
+            raise InputError("hit", received=f"{hit[row]:g} in {place(row)}", expected="0 (miss) or 1 (hit)")
     else:
         wrong = ~((total >= 1) & (total == np.round(total)))
         if wrong.any():
             row = int(np.flatnonzero(wrong)[0])
-            raise InputError("trials", received=f"{total[row]:g} in row {row + 1}", expected="a whole number >= 1")
+            raise InputError("trials", received=f"{total[row]:g} in {place(row)}", expected="a whole number >= 1")
         wrong = ~((hit >= 0) & (hit <= total) & (hit == np.round(hit)))
         if wrong.any():
             row = int(np.flatnonzero(wrong)[0])
             raise InputError(
                 "hit",
-                received=f"{hit[row]:g} of {total[row]:g} trials in row {row + 1}",
+                received=f"{hit[row]:g} of {total[row]:g} trials in {place(row)}",
                 expected="a whole number from 0 to the number of trials",
             )
     labels = {"network": network, "image": image, "site": site}
@@ -121,7 +128,7 @@ def group_by_size(x: Array, hits: Array, misses: Array) -> tuple[Array, Array, A
     return distinct, up, down
 
 
-def _numbers(name: str, values: Any) -> Array:
+def _numbers(name: str, values: Any, place: Callable[[int], str]) -> Array:
     try:
         column = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
@@ -133,7 +140,7 @@ def _numbers(name: str, values: Any) -> Array:
         row = int(np.flatnonzero(wrong)[0])
         raise InputError(
             name,
-            received=f"{column[row]} in row {row + 1} ({int(wrong.sum())} such rows)",
+            received=f"{column[row]} in {place(row)} ({int(wrong.sum())} such rows)",
             expected="finite numbers",
             remedy="fill in or remove these rows",
         )

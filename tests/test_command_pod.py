@@ -150,14 +150,14 @@ def test_separated_data_say_so(capsys, tmp_path):
         ("size,hit\n1,1\n2,0\n", ["--size", "siz"], "did you mean size?"),
         ("size,hit\n1,1\ninf,0\n", [], "line 3: got 'inf'"),
         ("size,hit\n1,1\n2,0,3,4,5\n", [], "got 5 columns; expected 2"),
-        ("size,hit\n1,1\n2,3\n", [], "counts of hits need --trials"),
+        ("size,hit\n1,1\n2,3\n", [], "counts of hits need trials=... (--trials)"),
         ("size,hit\n1,1\n2,0\n", ["--where", "hit"], "expected COLUMN=VALUE"),
         ("size,hit\n1,1\n2,0\n", ["--decision", "3"], "--decision: got without a response"),
         ("size,r\n1,1\n2,0\n", ["--response", "r"], "for example --decision 200"),
         ("size,r\n1,1\n2,0\n", ["--response", "r", "--decision", "1", "--box-cox", "big"], "expected a number or auto"),
         ("size,hit\n1,1\n2,0\n", ["--bootstrap", "3"], "20 refits or more"),
         ("size,hit\n-1,1\n2,0\n", ["--log-size"], "sizes above 0"),
-        ("size,hit\n1,1\n2,0\n", ["--repeats", "scaled"], "name its column with --site"),
+        ("size,hit\n1,1\n2,0\n", ["--repeats", "scaled"], "name its column: site=... (--site)"),
         ("size,hit\n1,1\n2,0\n", ["--link", "log"], "invalid choice"),
         ("size,hit\n1,1\n2,0\n", ["--covariate", "size=1"], "another property than the size"),
     ],
@@ -224,7 +224,7 @@ def test_a_margin_is_a_share_below_1(capsys, tmp_path, margin):
 
 
 def test_a_size_far_from_all_others_is_named(capsys, tmp_path):
-    told = "the size 1e+12 in row 61 lies far from all others, "
+    told = "the size 1e+12 in line 62 lies far from all others, "
     rng = np.random.default_rng(0)
     size = rng.uniform(0.5, 4, 60)
     hit = (rng.random(60) < 1 / (1 + np.exp(-3 * (size - 2)))).astype(int)

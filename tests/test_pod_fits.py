@@ -535,3 +535,17 @@ def test_bad_input_is_named(arguments, words):
     with pytest.raises(InputError) as error:
         fit_pod(**arguments)
     assert words in str(error.value)
+
+
+def test_falling_tables_that_separate_promise_no_bounds():
+    falling = fit_pod(np.arange(1.0, 7.0), [1, 1, 1, 0, 0, 0])
+    rising = fit_pod(np.arange(1.0, 7.0), [0, 0, 0, 1, 1, 1])
+    assert falling.separated and falling.a90 is None
+    assert not any("upper bounds" in note for note in falling.warnings)
+    assert any("with Wald's upper bounds on a90" in note for note in rising.warnings)
+
+
+def test_one_size_separates_nothing_and_looks_that_all_end_alike_separate():
+    """`separated`: no finite curve is the most likely one; at one size none has a slope, however hits and misses fall."""
+    assert not fit_pod([2.0] * 4, [0, 1, 0, 1]).separated
+    assert fit_pod([1.0, 2.0, 3.0], [1, 1, 1]).separated

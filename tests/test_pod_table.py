@@ -8,6 +8,7 @@ import pytest
 
 from raytwin.errors import FileFormatError, InputError
 from raytwin.pod import read_pod_table
+from raytwin.pod.answer import trials_from_table
 
 
 def written(folder: Path, text: str) -> Path:
@@ -157,6 +158,19 @@ def test_files_that_are_no_tables_are_said_to_be_none(tmp_path):
         read_pod_table(binary)
 
 
+def test_a_row_is_called_by_its_line_in_a_file_and_by_its_number_in_memory(tmp_path):
+    columns = {"size": [1, 2, -3], "hit": [0, 1, 1], "note": ["1", "2", "x"]}
+    path = written(tmp_path, "# sizes\nsize,hit,note\n1,0,1\n2,1,2\n-3,1,x\n")
+    for source, place in ((path, "line 5"), (columns, "row 3")):
+        table = read_pod_table(source)
+        with pytest.raises(InputError, match=f"size: got -3 in {place}"):
+            trials_from_table(table, log_size=True)
+        with pytest.raises(InputError, match=f"column note, {place}: got 'x'"):
+            table.numbers("note")
+        with pytest.raises(InputError, match=f"column note, {place}: got 'x'"):
+            read_pod_table(source, size="note")
+
+
 @pytest.mark.parametrize(
     ("encoding", "received"),
     [("latin-1", "another encoding than UTF-8 (line 3, byte 0xfc)"), ("utf-16", "text in UTF-16")],
@@ -183,7 +197,7 @@ def test_a_data_frame_without_rows_is_an_empty_table():
 
 def test_a_column_asked_for_as_numbers_must_hold_numbers(tmp_path):
     table = read_pod_table(written(tmp_path, "size,hit,colour\n1,1,red\n2,0,blue\n"))
-    with pytest.raises(InputError, match="column colour, row 1: got 'red'"):
+    with pytest.raises(InputError, match="column colour, line 2: got 'red'"):
         table.numbers("colour")
     with pytest.raises(InputError, match="column: got 'thickness'"):
         table.numbers("thickness")

@@ -11,7 +11,7 @@ _FAR = 100.0  # ranges of the others: no study has a size so far away
 
 @contextmanager
 def naming_far_sizes(**tables: PodTable) -> Iterator[None]:
-    """Where a fit fails and one size of a table lies far from all others, the error names its row."""
+    """Where a fit fails and one size of a table lies far from all others, the error says in which line or row."""
     try:
         yield
     except FitError:
@@ -29,6 +29,7 @@ def far_size(table: PodTable) -> str:
     size = np.sort(table.size)
     for far, others in ((size[-1], size[size < size[-1]]), (size[0], size[size > size[0]])):
         if len(others) > 1 and np.abs(others - far).min() > _FAR * np.ptp(others) > 0:
-            row = int(np.flatnonzero(table.size == far)[0]) + 1
-            return f"the size {far:g} in row {row} lies far from all others, {others[0]:g} to {others[-1]:g}; check it"
+            row = int(np.flatnonzero(table.size == far)[0])
+            place = table.places[row] if table.places else f"row {row + 1}"
+            return f"the size {far:g} in {place} lies far from all others, {others[0]:g} to {others[-1]:g}; check it"
     return ""

@@ -20,7 +20,7 @@ from scipy.special import expit, ndtr
 from raytwin.pod import LINKS, Trials, check_trials, compare_models
 from raytwin.pod.hit_miss import PodFit, fit_pooled, trusted_bound
 from raytwin.pod.likelihood import size_bound
-from raytwin.pod.models import better_curve, over_links, widened
+from raytwin.pod.models import with_links_open
 from raytwin.pod.response import fit_response_pod
 
 SHAPES: dict[str, Callable[[Any], Any]] = {
@@ -78,13 +78,10 @@ def of_shapes(simulations: int, trials: int) -> None:
             fit = fit_pooled(table, link=LINKS["cloglog"], log_size=False, method="auto")
             one.append(bounds_of(fit))
             alternatives = compare_models(table)
-            found = over_links(alternatives, link="cloglog", log_size=False)
-            if fit.separated or found is None:
-                given.append(bounds_of(fit))
-                continue
-            joined.append((found.a90_95, found.a90_low, found.a90_high))
-            best = better_curve(alternatives, fit)
-            given.append(bounds_of(fit if best is None else widened(fit, found, best)))
+            answered, found, _ = with_links_open(fit, alternatives, named=False)
+            given.append(bounds_of(answered))
+            if found is not None:
+                joined.append((found.a90_95, found.a90_low, found.a90_high))
         text = f"n {trials} {name:20} one link {shares(one, true)}; as given {shares(given, true)}"
         print(f"{text}; over links {shares(joined, true)}", flush=True)
 

@@ -41,8 +41,16 @@ def test_intervals_hold_the_noise_of_each_exposure_that_all_networks_see():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("networks", "images"), [(4, 40), (4, 80), (4, 110), (10, 80)])
-@pytest.mark.parametrize(("repeats", "count"), [("cluster", 400), ("crossed", 40)])
+@pytest.mark.parametrize(
+    ("networks", "images", "repeats", "count"),
+    [
+        (4, 40, "cluster", 400),
+        (4, 80, "cluster", 400),
+        (4, 110, "cluster", 400),
+        (10, 80, "cluster", 400),
+        (4, 80, "crossed", 40),
+    ],
+)
 def test_paired_intervals_cover_as_often_as_they_say(networks, images, repeats, count):
     random = np.random.default_rng(17)
     inside = []

@@ -480,12 +480,7 @@ def _trial(task: Task, folder: Path, tell: Tell) -> dict[str, Any]:
         thresholds = thresholds_from_images(
             networks, train, folder / "thresholds.json", trying["marked_share"], device=task["device"]
         )
-        reluctant = sum(value <= LOWEST_THRESHOLD for value in thresholds.values())
-        if reluctant:
-            warnings.append(
-                f"{reluctant} of {len(thresholds)} networks mark fewer images than marked_share = {trying['marked_share']:g} asks"
-                f" for, even at the lowest threshold, {LOWEST_THRESHOLD:g}: they were tried as less ready to mark than others"
-            )
+        warnings += said_of_reluctant(thresholds, trying["marked_share"])
     else:
         thresholds = dict.fromkeys(range(training["networks"]), trying["threshold"])
     detect_on_file(networks, test, hits, {}, thresholds, device=task["device"])
@@ -495,6 +490,17 @@ def _trial(task: Task, folder: Path, tell: Tell) -> dict[str, Any]:
         "thresholds": {str(number): value for number, value in thresholds.items()},
         "hits_sha256": sha256_of_file(hits),
     }
+
+
+def said_of_reluctant(thresholds: Mapping[int, float], marked_share: float) -> list[str]:
+    """One line where networks have the lowest threshold and so mark fewer images than they are asked to; thresholds: by network."""
+    reluctant = sum(value <= LOWEST_THRESHOLD for value in thresholds.values())
+    if not reluctant:
+        return []
+    return [
+        f"{reluctant} of {len(thresholds)} networks mark fewer images than marked_share = {marked_share:g} asks for, even at the"
+        f" lowest threshold, {LOWEST_THRESHOLD:g}: they were tried as less ready to mark than others"
+    ]
 
 
 def _generate(

@@ -889,3 +889,9 @@ def test_the_page_fits_asks_nobody_and_draws_its_figures(line, whole, check_page
         page = folder / f"{name}.html"
         write_report(answer, page, campaign=campaign, seconds={}, version="1", interactive=interactive)
         check_page(page, static=not interactive)
+
+
+def test_networks_at_the_lowest_threshold_are_told():
+    assert sweep_trial.said_of_reluctant({0: 0.3, 1: 0.02}, 0.1) == []
+    (line,) = sweep_trial.said_of_reluctant({0: 0.01, 1: 0.02, 2: 0.01}, 0.1)
+    assert line.startswith("2 of 3 networks mark fewer images than marked_share = 0.1 asks for")

@@ -237,6 +237,14 @@ DAMAGES = {
         ),
         "a damaged file",
     ),
+    "a flat of fewer than no exposures": (
+        lambda file: file["levels/0000"].attrs.update(exposures=-3.0),
+        "exposures of twin .*: got -3.0; expected a finite number, 0 or more",
+    ),
+    "noise of the dark that is no number": (
+        lambda file: file["maps"].attrs.update(dark_noise=[math.nan, 0.0, 0.0]),
+        "dark_noise of twin .*; expected three numbers",
+    ),
     "draws that no exponent holds": (
         lambda file: replaced(file, "spectral/samples", 1e7 * file["spectral/samples"][()]),
         "all below 710",

@@ -289,7 +289,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
                     _get_estimate(group, "photon_transfer_slope_DN"), "photon_transfer_slope_DN", path
                 ),
                 rate_DN_per_mAs=_get_estimate(group, "rate_DN_per_mAs"),
-                **{name: _optional_float(group, name) for name in _OF_LEVELS},
+                **{name: _optional_number(group, name, path) for name in _OF_LEVELS},
                 flat_shape=_array(group, "flat_shape", np.float32),
                 series=_texts(group.attrs["series"]),
                 role=_text(group.attrs["role"]),
@@ -438,11 +438,20 @@ def _optional_float(group: Any, name: str) -> float | None:
     return float(group.attrs[name]) if name in group.attrs else None
 
 
+def _optional_number(group: Any, name: str, path: object) -> float | None:
+    """A finite number of 0 or more, or None."""
+    value = _optional_float(group, name)
+    if value is not None and not 0.0 <= value < math.inf:
+        raise FileFormatError(f"{name} of twin {path}", received=value, expected="a finite number, 0 or more")
+    return value
+
+
 def _dark_noise(maps: Any, path: object) -> tuple[float, float, float] | None:
-    """Noise of the dark; files before raytwin 0.3 do not say it."""
+    """Noise of the dark; None where the file does not say it."""
     if "dark_noise" not in maps.attrs:
         return None
-    values = np.atleast_1d(np.asarray(maps.attrs["dark_noise"], dtype=np.float64))
-    if values.shape != (3,) or not np.all(np.isfinite(values)):
-        raise FileFormatError(f"dark_noise of twin {path}", received=f"{values.tolist()}", expected="three numbers")
-    return float(values[0]), float(values[1]), float(values[2])
+    stored = np.atleast_1d(np.asarray(maps.attrs["dark_noise"]))
+    if stored.shape != (3,) or stored.dtype.kind not in "iuf" or not np.all(np.isfinite(stored)):
+        raise FileFormatError(f"dark_noise of twin {path}", received=f"{stored.tolist()}", expected="three numbers")
+    same, mixed, grown = map(float, stored)
+    return same, mixed, grown

@@ -7,7 +7,11 @@ import pytest
 from scipy.ndimage import correlate1d
 
 from raytwin.calibration.spread.noise_power import compute_difference_power, compute_noise_power
+from raytwin.calibration.spread.spread_candidates import best_of, starts_of
+from raytwin.calibration.spread.spread_families import share_density
 from raytwin.calibration.spread.spread_fit import fit_spread
+from raytwin.calibration.spread.spread_members import masses_of_shares
+from raytwin.calibration.spread.spread_problem import SpreadProblem
 from raytwin.errors import FitError
 from raytwin.generator.spread.noise import sample_frame_noise
 from raytwin.generator.spread.psf import Spread
@@ -332,6 +336,34 @@ def test_a_screen_is_never_taken_for_one_without_a_tail():
     # but for simulations, which these might be: one screen in a hundred
     assert not any("tail" not in family and "counted" not in family for family in screen.criteria)
     assert sum(item.probability for item in screen.others if item.value.model == "sampled") < 0.03
+
+
+@pytest.mark.parametrize(("middle", "sd"), [(0.0, 0.1), (0.05, 0.02), (-0.1, 0.08), (0.15, 0.1)])
+def test_shares_of_a_tail_stand_for_the_whole_posterior(middle, sd):
+    """Six shares give its mean and variance as an integral does, at the bound of no tail too."""
+    nodes = np.unique(np.clip(max(middle, 0.0) + sd * np.arange(-2.0, 4.0), 0.0, 1.0))
+    chi_squares = ((nodes - middle) / sd) ** 2
+    weights = masses_of_shares(nodes, chi_squares) * np.exp(-0.5 * chi_squares)
+    fine = np.linspace(0.0, 1.0, 20_001)
+    density = np.array([share_density(share) for share in fine]) * np.exp(-0.5 * ((fine - middle) / sd) ** 2)
+    assert weights.sum() == pytest.approx(np.trapezoid(density, fine), rel=0.05)
+    mean = np.trapezoid(density * fine, fine) / np.trapezoid(density, fine)
+    assert weights @ nodes / weights.sum() == pytest.approx(mean, rel=0.05)
+
+
+def test_at_the_bound_of_no_tail_the_core_is_the_best_one_without_a_tail():
+    problem = SpreadProblem(powers(SPREADS["narrow"], seed=8, count=4), GROUPS, None, screen=True, axes="both")
+    forms = {form.name: form for form in problem.forms.families}
+    core = forms["two widths, light collected in pixels"]
+    tailed = forms["two widths with an exponential tail"]
+    alone = best_of(problem, core, starts_of(core))
+    found = best_of(problem, tailed, starts_of(tailed))
+    assert found.chi_square < alone.chi_square + 0.05
+    for share in (0.0, 0.05):
+        same = found.with_share(problem, share)
+        assert same.theta[tailed.names.index("tail_share")] == share
+        assert same.chi_square >= found.chi_square - 0.05
+    assert found.with_share(problem, 0.0).chi_square == pytest.approx(alone.chi_square, abs=0.05)
 
 
 def test_darks_alone_cannot_give_a_gain():

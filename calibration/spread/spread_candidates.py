@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,24 +142,15 @@ class Candidate:
         return float(self.covariance[place, place])
 
     def with_share(self, problem: SpreadProblem, share: float) -> "Candidate":
-        """The spread with another share of light in the tail and a core that follows, as its fit says it does."""
+        """The best spread of this reach with another share of light in the tail."""
         share_at = self.form.names.index("tail_share")
         linear = len(self.coefficients)
         place = linear + share_at
-        follows = self.covariance[place] / self.covariance[place, place]
-        theta = self.theta + follows[linear:] * (share - self.theta[share_at])
-        theta = np.array([np.clip(value, *_BOUNDS[name]) for name, value in zip(self.form.names, theta, strict=True)])
-        spread = self.form.spread(theta)
-        coefficients, chi_square = problem.solve(spread)
-        return replace(
-            self,
-            theta=theta,
-            spread=spread,
-            coefficients=coefficients,
-            covariance=self.covariance - np.outer(follows, self.covariance[place]),
-            chi_square=chi_square,
-            variance_share=_variance_share(problem, spread),
-        )
+        # the core follows, at first as this fit says that it does
+        follows = self.covariance[place, linear:] / self.covariance[place, place]
+        theta = self.theta + follows * (share - self.theta[share_at])
+        theta[share_at] = share
+        return best_of(problem, self.form, [theta], fixed=TAIL)
 
 
 def criterion(problem: SpreadProblem, candidate: Candidate) -> float:
@@ -233,9 +224,7 @@ def _descended(
     until they help)."""
     coefficients, chi_square = problem.solve(form.spread(theta))
     for _ in range(_MOST_STEPS):
-        normal = normal_at(problem, form, theta, coefficients, free)
-        step = np.zeros(len(theta))
-        step[list(free)] = normal.solved(problem.not_negative)[0][-len(free) :]
+        step = _step(problem, form, theta, coefficients, bounds, free)
         for share in (1.0, 0.5, 0.25, 0.1, 0.03):
             moved = np.clip(theta + share * step, bounds[0], bounds[1])
             there, value = problem.solve(form.spread(moved))
@@ -248,6 +237,35 @@ def _descended(
         if gained < SETTLED:
             break
     return theta, chi_square
+
+
+def _step(
+    problem: SpreadProblem,
+    form: Family,
+    theta: FloatArray,
+    coefficients: FloatArray,
+    bounds: FloatArray,
+    free: Sequence[int],
+) -> FloatArray:
+    """Gauss and Newton's step of the parameters (name,); those at a bound that it would cross stay there, and the others take
+    the best step without them."""
+    normal = normal_at(problem, form, theta, coefficients, free)
+    moving, linear = list(free), len(coefficients)
+    while True:
+        step = np.zeros(len(theta))
+        if not moving:
+            return step
+        step[moving] = normal.solved(problem.not_negative)[0][linear:]
+        blocked = [
+            place
+            for place in moving
+            if (theta[place] <= bounds[0, place] and step[place] < 0)
+            or (theta[place] >= bounds[1, place] and step[place] > 0)
+        ]
+        if not blocked:
+            return step
+        normal = normal.without([linear + moving.index(place) for place in blocked])
+        moving = [place for place in moving if place not in blocked]
 
 
 def _moved(form: Family, theta: FloatArray, place: int) -> list[tuple[float, Spread]]:

@@ -5,17 +5,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .spread_candidates import Candidate, best_of, criterion, starts_of
 from .spread_changes import learn_changes
 from .spread_families import LOG_REACH, TAIL, Family, reach_mass, share_density
 from .spread_problem import SpreadProblem
 
+FloatArray = NDArray[np.float64]
 Members = list[tuple[float, Candidate]]  # each with the logarithm of its weight before chi-square counts
 _OfReaches = list[tuple[float, Candidate]]  # a family at reaches of the tail, each with its share of all reaches
 _REWEIGHTED = 3  # times: the power that the weights come from then no longer moves
 _REACH_STEP = math.log(1.5)  # changes the gain by less than a share is known to
 _STEPS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0)  # standard deviations, at which share and reach are averaged over
+_FINE_STEPS = 50  # between two of these shares, over which prior and likelihood are summed
 _MOST_SD = 0.15  # of the share between such steps, which then reach over most of what it can be
 
 
@@ -81,9 +84,29 @@ def _with_tails(
                 yield form.of_tails * of_reach, best
                 continue
             sd = min(math.sqrt(variance), _MOST_SD)
-            for share, width in _steps(float(best.theta[share_at]), sd, (0.0, 1.0)):
-                density = form.of_tails * of_reach * share_density(share)
-                yield width * density, best.with_share(problem, share)
+            shares = _about(float(best.theta[share_at]), sd, (0.0, 1.0))
+            items = [best.with_share(problem, share) for share in shares]
+            for item, mass in zip(items, masses_of_shares(shares, [one.chi_square for one in items]), strict=True):
+                yield form.of_tails * of_reach * mass, item
+
+
+def masses_of_shares(shares: Sequence[float], chi_squares: Sequence[float]) -> FloatArray:
+    """Prior mass (share,) for which each share stands, so that sums over the shares, weighted by their likelihoods, are integrals.
+
+    Between two shares chi-square is interpolated, and what depends on the share is linear: near a share of 0 the prior and the
+    likelihood fall by much from one of a few to the next.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    nodes = np.asarray(shares)
+    fine = np.linspace(nodes[0], nodes[-1], _FINE_STEPS * (len(nodes) - 1) + 1)
+    chi_square = PchipInterpolator(nodes, chi_squares)(fine)
+    likely = np.array([share_density(float(share)) for share in fine]) * np.exp(
+        -0.5 * (chi_square - np.min(chi_squares))
+    )
+    hats = np.stack([np.interp(fine, nodes, one) for one in np.eye(len(nodes))])
+    mass = np.trapezoid(hats * likely, fine, axis=1)
+    return np.asarray(mass * np.exp(0.5 * (np.asarray(chi_squares) - np.min(chi_squares))))
 
 
 def _of_reaches(problem: SpreadProblem, form: Family) -> _OfReaches:
@@ -117,6 +140,11 @@ def _of_reaches(problem: SpreadProblem, form: Family) -> _OfReaches:
 
 def _steps(middle: float, sd: float, bounds: tuple[float, float]) -> list[tuple[float, float]]:
     """Values about a middle, inside the bounds, and the width that each stands for."""
-    values = np.unique(np.clip(middle + sd * np.array(_STEPS), *bounds))
+    values = _about(middle, sd, bounds)
     halves = 0.5 * np.diff(values, prepend=values[0], append=values[-1])
-    return [(float(value), float(width)) for value, width in zip(values, halves[:-1] + halves[1:], strict=True)]
+    return [(value, float(width)) for value, width in zip(values, halves[:-1] + halves[1:], strict=True)]
+
+
+def _about(middle: float, sd: float, bounds: tuple[float, float]) -> list[float]:
+    """Values about a middle, inside the bounds."""
+    return [float(value) for value in np.unique(np.clip(middle + sd * np.array(_STEPS), *bounds))]

@@ -69,6 +69,11 @@ class Normal:
             # the one that would be most negative in its own standard deviations goes first
             free[min(negative, key=lambda place: found[place] * math.sqrt(self.matrix[place, place]))] = False
 
+    def without(self, places: Sequence[int]) -> "Normal":
+        """With the parameters at these places held where they are."""
+        rest = np.delete(np.arange(len(self.right)), places)
+        return replace(self, matrix=self.matrix[np.ix_(rest, rest)], right=self.right[rest])
+
     def with_white_prior(self, prior: WhitePrior) -> "Normal":
         """With a prior of the white parts."""
         matrix = self.matrix.copy()

@@ -10,7 +10,7 @@ from raytwin.calibration.spread.noise_power import compute_difference_power, com
 from raytwin.calibration.spread.spread_candidates import best_of, starts_of
 from raytwin.calibration.spread.spread_families import share_density
 from raytwin.calibration.spread.spread_fit import fit_spread
-from raytwin.calibration.spread.spread_members import masses_of_shares
+from raytwin.calibration.spread.spread_members import log_weights_of_shares
 from raytwin.calibration.spread.spread_problem import SpreadProblem
 from raytwin.errors import FitError
 from raytwin.generator.spread.noise import sample_frame_noise
@@ -343,7 +343,7 @@ def test_shares_of_a_tail_stand_for_the_whole_posterior(middle, sd):
     """Six shares give its mean and variance as an integral does, at the bound of no tail too."""
     nodes = np.unique(np.clip(max(middle, 0.0) + sd * np.arange(-2.0, 4.0), 0.0, 1.0))
     chi_squares = ((nodes - middle) / sd) ** 2
-    weights = masses_of_shares(nodes, chi_squares) * np.exp(-0.5 * chi_squares)
+    weights = np.exp(log_weights_of_shares(nodes, chi_squares))
     fine = np.linspace(0.0, 1.0, 20_001)
     density = np.array([share_density(share) for share in fine]) * np.exp(-0.5 * ((fine - middle) / sd) ** 2)
     assert weights.sum() == pytest.approx(np.trapezoid(density, fine), rel=0.05)

@@ -681,6 +681,13 @@ def test_motion_blurs_along_the_belt_in_proportion_to_the_exposure(series_line, 
             assert found == pytest.approx(float(np.sinc(length * frequency)), rel=1e-3)
 
 
+@pytest.mark.parametrize(("power", "length_px"), [(0.0, 4.0), (0.5, 4.0 * 0.4**0.5)])
+def test_a_vibration_goes_as_far_in_a_short_exposure_as_in_a_long_one(series_line, power, length_px):
+    asked = request("object", setting="kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05", source_object_mm=990.0)
+    found, frequency = transfer(series_line, asked, applied("motion_blur", 4.0, exposure_power=power), 0)
+    assert found == pytest.approx(float(np.sinc(length_px * frequency)), rel=1e-3)
+
+
 @pytest.mark.parametrize("uneven", [-0.7, 0.3, 1.0])
 def test_an_object_that_moves_unevenly_is_the_mean_of_where_it_stands(series_line, uneven):
     """Pictures of the object, displaced from place to place, averaged over the exposure."""

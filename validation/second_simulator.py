@@ -294,6 +294,7 @@ ALWAYS = (
     "misregistration",
     "composition_error",
     "motion_in_some",
+    "vibration",
 )
 # effect: strength, and whether it has the catalogue's definition (else it is only asked whether it is named)
 CASES = {
@@ -317,6 +318,7 @@ CASES = {
     "k_fluorescence": (25.0, True),
     "motion_blur": (0.8, True),
     "motion_in_some": (4.0, True),
+    "vibration": (2.0, False),
     "misregistration": (0.6, True),
     "heel": (5.0, True),
     "composition_error": (5.0, True),
@@ -337,7 +339,8 @@ PAIRS = (
     "nonlinearity+motion_blur",
 )
 UNKNOWN = ("wandering_tiles",)
-NAMED = {"motion_in_some": "motion_blur", "tiles": "tile_gain"}  # of products alone: the table moved there
+# of products alone: the table moved there; to and fro, as far in a short exposure as in a long one
+NAMED = {"motion_in_some": "motion_blur", "vibration": "motion_blur", "tiles": "tile_gain"}
 NOT_OF_COUNTS = (
     "row_noise",
     "dark_drift",
@@ -572,8 +575,10 @@ class Line:
             magnified = self.of.detector_mm / (self.of.far_mm if far else self.of.near_mm) - 1.0
             width_px = on["focal_spot"] * magnified / self.of.pixel_mm / math.sqrt(8.0 * math.log(2.0))
             signal, variance = gaussian_filter(signal, width_px), gaussian_filter(variance, width_px)
-        if "motion_blur" in on:
-            places = np.linspace(-0.5, 0.5, 9) * on["motion_blur"] * exposure_ms / 50.0
+        if "motion_blur" in on or "vibration" in on:
+            places = np.linspace(-0.5, 0.5, 9) * on.get("motion_blur", 0.0) * exposure_ms / 50.0
+            if "vibration" in on:
+                places = on["vibration"] / 2.0 * np.sin(np.linspace(0.0, 2.0 * math.pi, 32, endpoint=False))
             signal = np.mean([shift(signal, (place, 0.0), order=1, mode="nearest") for place in places], axis=0)
         return signal, variance
 

@@ -38,15 +38,12 @@ class SpreadAverage:
     inflation: float
 
     @classmethod
-    def of(cls, members: Members, independent: float) -> "SpreadAverage":
-        """Of these spreads, fitted to so many independent powers."""
-        candidates = tuple(item for _, item in members)
-        least = likeliest(candidates).chi_square
-        inflation = max(1.0, least / independent)
-        logs = np.array([log_mass - 0.5 * (item.chi_square - least) / inflation for log_mass, item in members])
-        weights = np.exp(logs - logs.max())
+    def of(cls, members: Members) -> "SpreadAverage":
+        """Of these spreads."""
+        weights = np.exp(members.log_weights - members.log_weights.max())
         weights /= weights.sum()
-        return cls(candidates, weights, _representative(candidates, weights, (least, inflation)), inflation)
+        chosen = _representative(members.candidates, weights, members.inflation)
+        return cls(members.candidates, weights, chosen, members.inflation)
 
     def criteria(self) -> dict[str, float]:
         """Family -> twice the logarithm of the best family's evidence over its own."""
@@ -111,15 +108,15 @@ class SpreadAverage:
         return {name: math.sqrt(value) for name, value in variance.items()}
 
 
-def _representative(candidates: Sequence[Candidate], weights: FloatArray, likelihood: tuple[float, float]) -> Candidate:
+def _representative(candidates: Sequence[Candidate], weights: FloatArray, inflation: float) -> Candidate:
     """The spread with the fewest parameters of those that are likely and whose gains lie near the mean of all.
 
     Args:
         candidates: spreads.
         weights: of each; they add up to 1.
-        likelihood: least chi-square, and what a chi-square is divided by.
+        inflation: what a chi-square is divided by.
     """
-    least, inflation = likelihood
+    least = likeliest(candidates).chi_square
     scale = np.array([float(np.mean(_log_ratio(item.gains, candidates[0].gains))) for item in candidates])
     mean = float(weights @ scale)
     sd = math.sqrt(float(weights @ (scale - mean) ** 2))

@@ -181,11 +181,11 @@ def _fit_of(
 def _average(problem: SpreadProblem) -> SpreadAverage:
     """Spreads that the noise leaves open, with slow changes of the series that show any."""
     members = members_of(problem)
-    drifting = find_drifting(problem, likeliest([item for _, item in members]).spread)
+    drifting = find_drifting(problem, likeliest(members.candidates).spread)
     if drifting != problem.drifting:
         problem.drifting = drifting
         members = members_of(problem)
-    return SpreadAverage.of(members, problem.independent)
+    return SpreadAverage.of(members)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -13,7 +14,6 @@ from .spread_families import LOG_REACH, TAIL, Family, reach_mass, share_density
 from .spread_problem import SpreadProblem
 
 FloatArray = NDArray[np.float64]
-Members = list[tuple[float, Candidate]]  # each with the logarithm of its weight before chi-square counts
 _OfReaches = list[tuple[float, Candidate]]  # a family at reaches of the tail, each with its share of all reaches
 _REWEIGHTED = 3  # times: the power that the weights come from then no longer moves
 _REACH_STEP = math.log(1.5)  # changes the gain by less than a share is known to
@@ -22,8 +22,38 @@ _FINE_STEPS = 50  # between two of these shares, over which prior and likelihood
 _MOST_SD = 0.15  # of the share between such steps, which then reach over most of what it can be
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Members:
+    """Spreads that the data leave open.
+
+    Fields: candidates; log_weights (candidate,): logarithms of their probabilities, but for a constant; inflation: chi-square a
+    degree of freedom of the likeliest, 1 at least, which chi-squares are divided by.
+    """
+
+    candidates: tuple[Candidate, ...]
+    log_weights: FloatArray
+    inflation: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Tails:
+    """Spreads of one family and reach, the logarithm of that reach's prior probability, and the shares of light (share,) that their
+    tails have; empty: one spread, of a share that nothing tells."""
+
+    log_prior: float
+    candidates: tuple[Candidate, ...]
+    shares: tuple[float, ...] = ()
+
+    def log_weights(self, least: float, inflation: float) -> FloatArray:
+        """Logarithm of the probability that each stands for, chi-squares counted from the least."""
+        above = (np.array([item.chi_square for item in self.candidates]) - least) / inflation
+        if not self.shares:
+            return np.asarray(self.log_prior - 0.5 * above)
+        return self.log_prior + log_weights_of_shares(self.shares, above)
+
+
 def members_of(problem: SpreadProblem) -> Members:
-    """Spreads that the data leave open, with the logarithm of the weight of each before its chi-square counts.
+    """Spreads that the data leave open, with their probabilities.
 
     Tails are averaged over for the way that quanta meet pixels that is likelier with the best spread of any form.
     """
@@ -37,15 +67,26 @@ def members_of(problem: SpreadProblem) -> Members:
     of_all = max(problem.prior, key=lambda model: math.log(problem.prior[model][0]) - 0.5 * least[model])
     found = []
     for model, (prior, no_tail) in problem.prior.items():
-        found.append((prior * no_tail, best[model]))
-        if model == of_all:
-            found += [
-                (prior * (1.0 - no_tail) * mass, item) for mass, item in _with_tails(problem, best[model], general)
-            ]
-    return [
-        (math.log(mass) - 0.5 * (criterion(problem, item) - item.chi_square), item)
-        for mass, item in [one for one in found if one[0] > 0 and one[1].lit] or [(1.0, best[of_all])]
-    ]
+        if no_tail > 0.0:
+            found.append(_Tails(math.log(prior * no_tail), (best[model],)))
+        if model == of_all and no_tail < 1.0:
+            found += _with_tails(problem, best[model], general, prior * (1.0 - no_tail))
+    return _weighed(problem, found, _Tails(0.0, (best[of_all],)))
+
+
+def _weighed(problem: SpreadProblem, found: Sequence[_Tails], otherwise: _Tails) -> Members:
+    """All spreads found, or another one where each of them leaves a beam without quanta."""
+    any_lit = any(item.lit for one in found for item in one.candidates)
+    found = found if any_lit else [otherwise]
+    candidates = [item for one in found for item in one.candidates]
+    kept = [item.lit or not any_lit for item in candidates]
+    least = min(item.chi_square for item, keep in zip(candidates, kept, strict=True) if keep)
+    inflation = max(1.0, least / problem.independent)
+    log_weights = np.concatenate([one.log_weights(least, inflation) for one in found])
+    log_weights -= [0.5 * (criterion(problem, item) - item.chi_square) for item in candidates]
+    return Members(
+        tuple(item for item, keep in zip(candidates, kept, strict=True) if keep), log_weights[kept], inflation
+    )
 
 
 def likeliest(candidates: Sequence[Candidate]) -> Candidate:
@@ -68,45 +109,41 @@ def _cores(problem: SpreadProblem) -> list[Candidate]:
 
 
 def _with_tails(
-    problem: SpreadProblem, core: Candidate, known: Mapping[Family, _OfReaches]
-) -> Iterator[tuple[float, Candidate]]:
-    """Spreads with this core and tails of all laws, reaches and shares, each with its prior probability among tails.
+    problem: SpreadProblem, core: Candidate, known: Mapping[Family, _OfReaches], probability: float
+) -> Iterator[_Tails]:
+    """Spreads with this core and tails of all laws, reaches and shares.
 
-    known: families whose reaches have been tried.
+    known: families whose reaches have been tried; probability: prior, of all tails.
     """
     for form in problem.forms.families:
         if form.model != core.spread.model or set(form.names) != {*core.form.names, *TAIL}:
             continue
         share_at = form.names.index("tail_share")
         for of_reach, best in known.get(form) or _of_reaches(problem, form):
+            log_prior = math.log(probability * form.of_tails * of_reach)
             variance = best.parameter_variance("tail_share")
             if variance <= 0.0:
-                yield form.of_tails * of_reach, best
+                yield _Tails(log_prior, (best,))
                 continue
-            sd = min(math.sqrt(variance), _MOST_SD)
-            shares = _about(float(best.theta[share_at]), sd, (0.0, 1.0))
-            items = [best.with_share(problem, share) for share in shares]
-            for item, mass in zip(items, masses_of_shares(shares, [one.chi_square for one in items]), strict=True):
-                yield form.of_tails * of_reach * mass, item
+            shares = _about(float(best.theta[share_at]), min(math.sqrt(variance), _MOST_SD), (0.0, 1.0))
+            yield _Tails(log_prior, tuple(best.with_share(problem, share) for share in shares), tuple(shares))
 
 
-def masses_of_shares(shares: Sequence[float], chi_squares: Sequence[float]) -> FloatArray:
-    """Prior mass (share,) for which each share stands, so that sums over the shares, weighted by their likelihoods, are integrals.
+def log_weights_of_shares(shares: Sequence[float], chi_squares: FloatArray) -> FloatArray:
+    """Logarithms of weights (share,), with which sums over these shares are integrals over prior and likelihood.
 
     Between two shares chi-square is interpolated, and what depends on the share is linear: near a share of 0 the prior and the
     likelihood fall by much from one of a few to the next.
     """
     from scipy.interpolate import PchipInterpolator
 
-    nodes = np.asarray(shares)
+    nodes, least = np.asarray(shares), float(np.min(chi_squares))
     fine = np.linspace(nodes[0], nodes[-1], _FINE_STEPS * (len(nodes) - 1) + 1)
-    chi_square = PchipInterpolator(nodes, chi_squares)(fine)
-    likely = np.array([share_density(float(share)) for share in fine]) * np.exp(
-        -0.5 * (chi_square - np.min(chi_squares))
-    )
+    prior = np.array([share_density(float(share)) for share in fine])
+    likely = prior * np.exp(-0.5 * PchipInterpolator(nodes, chi_squares - least)(fine))
     hats = np.stack([np.interp(fine, nodes, one) for one in np.eye(len(nodes))])
-    mass = np.trapezoid(hats * likely, fine, axis=1)
-    return np.asarray(mass * np.exp(0.5 * (np.asarray(chi_squares) - np.min(chi_squares))))
+    weight = np.trapezoid(hats * likely, fine, axis=1)
+    return np.asarray(np.log(np.maximum(weight, np.finfo(np.float64).tiny)) - 0.5 * least)
 
 
 def _of_reaches(problem: SpreadProblem, form: Family) -> _OfReaches:

@@ -247,7 +247,8 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any] | None =
         units = {item.name: item.unit for item in effect.parameters}
         values = {"strength": strength(cause)}
         for name, value in cause.parameters.items():
-            values[name] = {"value": value, "low": value, "high": value, "unit": units.get(name, "")}
+            # the strength's interval holds what these leave open; they have none of their own
+            values[name] = {"value": value, "low": None, "high": None, "unit": units.get(name, "")}
         return values
 
     return {

@@ -148,8 +148,7 @@ def calibrated_maps(
     gain = np.zeros(good.shape) if flats else _gain_of_twin(twin)
     quantum = white = 0.0
     if not flats:
-        beams = [expected[item.name] for item in kept if item.request.beam_on and item.name in expected]
-        quantum, white = _gain_noise_of_twin(twin, [mean_over(model.signal_DN, good) for model in beams])
+        quantum, white = _gain_noise_of_twin(twin)
     gain_darks = dict.fromkeys(under.white_DN2, 0.0)
     for item in flats:
         model = expected[item.name]
@@ -222,19 +221,25 @@ def _gain_of_twin(twin: Twin) -> NDArray[np.float64]:
     return gain
 
 
-def _gain_noise_of_twin(twin: Twin, signals_DN: Sequence[float]) -> tuple[float, float]:
+def _gain_noise_of_twin(twin: Twin) -> tuple[float, float]:
     """Relative variance of one pixel of `_gain_of_twin` by noise: of quanta, and white.
 
-    A flat that does not say of how many exposures it is the mean counts as one exposure at the middle of `signals_DN`, the
-    session's.
+    Raises:
+        InputError: a flat does not say of how many exposures it is the mean, or at which signal.
     """
-    usual_DN = float(np.median(signals_DN)) if signals_DN else 0.0
     quantum = white = 0.0
     for level in twin.levels:
-        signal_DN, exposures = level.signal_DN or usual_DN, level.exposures or 1.0
-        if signal_DN > 0.0:
-            quantum += level.photon_transfer_slope_DN.value / (signal_DN * exposures)
-            white += (1.0 / exposures + (level.dark_noise or 0.0)) * (twin.noise.read_noise_DN.value / signal_DN) ** 2
+        if not level.signal_DN or not level.exposures:
+            raise InputError(
+                f"twin: flat {level.name}",
+                received="no signal or number of exposures",
+                expected="both, which the noise of its gain map follows from",
+                remedy="calibrate the twin again; earlier versions did not keep them",
+            )
+        quantum += level.photon_transfer_slope_DN.value / (level.signal_DN * level.exposures)
+        white += (1.0 / level.exposures + (level.dark_noise or 0.0)) * (
+            twin.noise.read_noise_DN.value / level.signal_DN
+        ) ** 2
     count = max(len(twin.levels), 1)
     return quantum / count**2, white / count**2
 

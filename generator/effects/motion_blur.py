@@ -1,8 +1,9 @@
 """Motion during the exposure: it blurs what stands in the beam and correlates no noise.
 
 Box of length l = v t M along the belt; of an object that grows faster or slower by a share a of its mean speed, the places
-l [u + a (u^2 - u)], u even from 0 to 1, about their mean. That mean lies l m from where the object is stated to be: exposures
-that start as it passes there have it half a path further on, the longer ones farther.
+l [u + a (u^2 - u)], u even from 0 to 1, about their mean. A vibration that is faster than the exposures goes as far in a short one
+as in a long one: l = v t_0 (t / t_0)^p M, p from 1, a steady speed, to 0. The mean of the places lies l m from where the object is
+stated to be: exposures that start as it passes there have it half a path further on, the longer ones farther.
 """
 
 import math
@@ -23,7 +24,7 @@ _STEPS_A_PX = 4.0  # of a path at uneven speed; each is a box of its own
 
 def _path_px(parameters: Mapping[str, float], request: SeriesRequest, twin: Twin) -> float:
     """Length of the path on the detector, px."""
-    length_px = parameters["strength"] * request.exposure_ms / STATED_MS
+    length_px = parameters["strength"] * (request.exposure_ms / STATED_MS) ** parameters["exposure_power"]
     usual, (to_object_mm, to_detector_mm) = twin.instrument.magnification, request.distances_mm(twin.instrument)
     if usual is None or to_object_mm is None or to_detector_mm is None:
         return length_px
@@ -70,7 +71,8 @@ MOTION_BLUR = Effect(
     title="object moves during the exposure",
     law=(
         r"H(f) = \int_0^1 e^{-2\pi i f \ell\,[u + a\,(u^2 - u)]}\,\mathrm{d}u,\quad "
-        r"\ell = s\,\frac{t}{50\ \mathrm{ms}}\,\frac{M}{M_\mathrm{usual}},\quad H(f) = \mathrm{sinc}(\ell f)\ \text{at}\ a = 0"
+        r"\ell = s\left(\frac{t}{50\ \mathrm{ms}}\right)^p\frac{M}{M_\mathrm{usual}},\quad "
+        r"H(f) = \mathrm{sinc}(\ell f)\ \text{at}\ a = 0"
     ),
     parameters=(
         Parameter(
@@ -90,6 +92,15 @@ MOTION_BLUR = Effect(
             high=1.0,
             default=0.0,
             source="speed at the end of an exposure over the mean one, less 1: from a start to a stop",
+            log=False,
+        ),
+        Parameter(
+            name="exposure_power",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=1.0,
+            source="of the path's growth with exposure: 1 at a steady speed, 0 of a vibration that is faster than the exposures",
             log=False,
         ),
         Parameter(
@@ -113,6 +124,9 @@ MOTION_BLUR = Effect(
     absorbed="nothing",
     timed=True,
     mean_shift=_mean_shift,
-    grid=Grid(shares=(0.0, 0.25, 0.5, 0.75, 1.0), variants=({"acceleration": -0.5}, {"acceleration": 0.5})),
+    grid=Grid(
+        shares=(0.0, 0.25, 0.5, 0.75, 1.0),
+        variants=({"acceleration": -0.5}, {"acceleration": 0.5}, {"exposure_power": 0.0}),
+    ),
     # as of a tail: two panels without effect, in squares of pixels, showed 6
 )

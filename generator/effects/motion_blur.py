@@ -24,7 +24,7 @@ _STEPS_A_PX = 4.0  # of a path at uneven speed; each is a box of its own
 
 def _path_px(parameters: Mapping[str, float], request: SeriesRequest, twin: Twin) -> float:
     """Length of the path on the detector, px."""
-    length_px = parameters["strength"] * (request.exposure_ms / STATED_MS) ** parameters["exposure_power"]
+    length_px: float = parameters["strength"] * (request.exposure_ms / STATED_MS) ** parameters["exposure_power"]
     usual, (to_object_mm, to_detector_mm) = twin.instrument.magnification, request.distances_mm(twin.instrument)
     if usual is None or to_object_mm is None or to_detector_mm is None:
         return length_px

@@ -116,6 +116,8 @@ def test_the_series_that_holds_the_difference_is_the_one_to_repeat():
     stiff = best_repeat(problem([first, second], noise=0.0), {"glare": (first, 10.0)}, {"scatter": (second, 10.0)})
     assert stiff is not None
     assert stiff.separation_then == pytest.approx(stiff.separation)
+    # however far they are apart already: that has not told one from the other
+    assert found.settles and not stiff.settles
     assert best_repeat(problem([first]), {"glare": (first, 10.0)}, {"glare": (first, 10.0)}) is None
 
 

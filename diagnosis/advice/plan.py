@@ -24,7 +24,7 @@ _FINE_GRID = 121  # strengths that are asked whether they are seen
 CLEAR = 5.0  # standard deviations
 _REPEATS = 4  # times as many frames
 _CANDIDATES = 4
-WORTH_IT = 3.0  # standard deviations between two explanations, from which a repeat settles the matter
+WORTH_IT = 3.0  # standard deviations that a measurement adds between two explanations, from which it settles the matter
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,8 +142,8 @@ class Proposal:
 
     @property
     def settles(self) -> bool:
-        """Whether the matter is settled with it."""
-        return self.separation_then >= WORTH_IT
+        """Whether the matter is settled with it: what is as it was told the two apart no better, however clearly it would."""
+        return self.separation_then**2 - self.separation**2 >= WORTH_IT**2
 
 
 def advice_text(proposals: Sequence[Proposal], first: Sequence[str], second: Sequence[str], *, lately: bool) -> str:
@@ -168,7 +168,7 @@ def advice_text(proposals: Sequence[Proposal], first: Sequence[str], second: Seq
     )
     weighed = "; ".join(f"{item.what}: {item.separation_then:.1f}" for item in proposals)
     text = (
-        f"nothing that was weighed tells {names} by {WORTH_IT:g} standard deviations ({weighed}; now"
+        f"nothing that was weighed tells {names} by {WORTH_IT:g} standard deviations more ({weighed}; now"
         f" {proposals[0].separation:.1f})."
     )
     if lately and any(item.measured for item in proposals):

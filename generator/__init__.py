@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from .kernels.kernels import (
         draw_key,
         sample_frames,
-        sample_quanta,
     )
     from .kernels.projection import (
         project_polychromatic,
@@ -208,7 +207,6 @@ _LAZY = {
     "sample_correlated_quanta": "spread.noise",
     "sample_frame_noise": "spread.noise",
     "sample_frames": "kernels.kernels",
-    "sample_quanta": "kernels.kernels",
     "sample_scene": "scenes.describe",
     "session_conditions": "frames.conditions",
     "shift_image": "spread.registration",
@@ -302,7 +300,6 @@ __all__ = [
     "sample_correlated_quanta",
     "sample_frame_noise",
     "sample_frames",
-    "sample_quanta",
     "sample_scene",
     "session_conditions",
     "shift_image",

@@ -103,7 +103,6 @@ def test_frames_are_those_of_the_compiled_loops_but_for_last_bits(backend):
     settings = {
         "gain_DN": 1.3,
         "key": 77,
-        "deposit_spread": 0.2,
         "gain_relative": rng.uniform(0.9, 1.1, (60, 81)),
         "kernel_1d": noise_kernel_1d("aperture", 0.6),
         "read_noise_DN": 1.5,

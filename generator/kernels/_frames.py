@@ -18,20 +18,16 @@ class Frames:
 
     signal: Any
     relative: Any
-    slope: Any  # quantum variance per signal
-    step: Any  # third cumulant over variance
-    excess: Any  # squared coefficient of variation of the deposits
+    slope: Any  # quantum variance per signal: DN of a quantum
     read_variance: Any
     dark: Any
     white_fraction: float
     kernel: FloatMap
-    signal_kernel: FloatMap  # empty: the signal is not spread
     reach: int
     electronics: bool
     steps_a_DN: float
     lowest: float
     highest: float
-    signal_share: float  # 1, or 0 for noise alone
     key: int
     first_frame: int
     frames: int

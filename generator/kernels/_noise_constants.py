@@ -7,7 +7,8 @@ STRIDE = 0x9E3779B9
 MIX_64 = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 STEP_64 = 0x9E3779B97F4A7C15
 
-STAGE_QUANTA, STAGE_FIRST_DEPOSIT, STAGE_SECOND_DEPOSIT, STAGE_ELECTRONICS = range(4)
+# what a random word is for; a frame keeps its bytes as long as these keep their numbers
+STAGE_QUANTA, STAGE_FEW_QUANTA, STAGE_ELECTRONICS = 0, 1, 3
 
 # ln(1 + x) = x - x^2 / 2 + x^3 P(x) for sqrt(1/2) <= 1 + x < sqrt(2), highest power first (Moshier, Cephes logf)
 LOGARITHM = (
@@ -38,6 +39,5 @@ COSINE = (
 # standard errors; it gets better as 1 / mean^3.
 EXPANSION_FROM = 20.0
 MOST_QUANTA = 1e30  # so that extreme settings end in noise, not in NaN
-LARGEST_INVERTED = 600.0  # beyond, exp(-mean) would end
 
 TAPS_TOGETHER = 8

@@ -19,9 +19,8 @@ from ._noise_constants import (
     MULTIPLIERS,
     SINE,
     STAGE_ELECTRONICS,
-    STAGE_FIRST_DEPOSIT,
+    STAGE_FEW_QUANTA,
     STAGE_QUANTA,
-    STAGE_SECOND_DEPOSIT,
     STEP_64,
     STRIDE,
     TAPS_TOGETHER,
@@ -195,67 +194,36 @@ def _invert(words: Any, mean: Any, count: Any, number: Any) -> None:
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
-def _draw_few(
-    key: Any, frame: Any, row: Any, quanta: Any, signal: Any, slope: Any, step: Any, excess: Any, words: Any, noise: Any
-) -> None:
-    """Replace the noise of pixels of few quanta: exact Poisson counts of deposits of one or of two sizes.
-
-    Two sizes (the Gauss quadrature of the deposits' distribution) have the right number of photons, mean, variance and
-    third cumulant; with excess 0 each count is worth `step`.
-    """
+def _draw_few(key: Any, frame: Any, row: Any, quanta: Any, slope: Any, words: Any, noise: Any) -> None:
+    """Replace the noise of pixels of few quanta by slope x (exact Poisson count - mean)."""
     columns = len(quanta)
     at = np.empty(columns, np.int64)
-    mean = np.empty((2, columns), np.float64)
-    worth = np.empty((2, columns), np.float64)
-    expected = np.empty(columns, np.float64)
+    mean = np.empty(columns, np.float64)
     number = 0
-    two = False
     for c in range(columns):
         if quanta[c] >= _FROM:
             continue
         if quanta[c] <= 0:
             noise[c] = 0.0
             continue
-        at[number] = c
-        if excess[c] <= 0:
-            mean[0, number], worth[0, number] = quanta[c], step[c]
-            mean[1, number], worth[1, number] = 0.0, 0.0
-            expected[number] = mean[0, number] * worth[0, number]
-        else:
-            # moments of a deposit over its mean: 1, 1 + excess, third
-            two = True
-            second = 1.0 + np.float64(excess[c])
-            third = np.float64(step[c]) / np.float64(slope[c]) * second * second
-            total = (third - second) / (second - 1.0)
-            middle = 0.5 * total
-            apart = np.sqrt(max(middle * middle - (total - second), 0.0))
-            small, large = max(middle - apart, 0.0), middle + apart
-            share = (1.0 - small) / (large - small)
-            photons = second * np.float64(signal[c]) / np.float64(slope[c])
-            one = np.float64(slope[c]) / second
-            mean[0, number], worth[0, number] = photons * share, one * large
-            mean[1, number], worth[1, number] = photons * (1.0 - share), one * small
-            expected[number] = mean[0, number] * worth[0, number] + mean[1, number] * worth[1, number]
+        at[number], mean[number] = c, quanta[c]
         number += 1
     if number == 0:
         return
     count = np.empty(columns, np.float64)
-    total_worth = np.zeros(number, np.float64)
     chosen = np.empty(number, np.uint32)
-    for which in range(2 if two else 1):
-        _fill_words(key, frame, STAGE_FIRST_DEPOSIT if which == 0 else STAGE_SECOND_DEPOSIT, row, words[:columns])
-        for i in range(number):
-            chosen[i] = words[at[i]]
-        _invert(chosen, mean[which], count, number)
-        for i in range(number):
-            total_worth[i] += count[i] * worth[which, i]
+    _fill_words(key, frame, STAGE_FEW_QUANTA, row, words[:columns])
     for i in range(number):
-        noise[at[i]] = total_worth[i] - expected[i]
+        chosen[i] = words[at[i]]
+    _invert(chosen, mean, count, number)
+    for i in range(number):
+        worth = np.float64(slope[at[i]])
+        noise[at[i]] = count[i] * worth - mean[i] * worth
 
 
 @njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _draw_many(quanta: Any, step: Any, noise: Any) -> None:
-    """Normal numbers in `noise` become step x (Poisson count - mean), for means of EXPANSION_FROM or more.
+def _draw_many(quanta: Any, slope: Any, noise: Any) -> None:
+    """Normal numbers in `noise` become slope x (Poisson count - mean), for means of EXPANSION_FROM or more.
 
     The quantile of a Poisson number as an expansion in a normal number (Giles 2016, ACM TOMS 42, 7, doi 10.1145/2699466),
     relative to the mean so that single precision does for any mean.
@@ -274,7 +242,7 @@ def _draw_many(quanta: Any, step: Any, noise: Any) -> None:
             * (np.float32(-8.0 / 405.0) + square * (np.float32(7.0 / 810.0) + square * np.float32(1.0 / 270.0)))
         )
         rest = mean - np.floor(mean)
-        noise[c] = step[c] * (np.floor(rest + away) - rest)
+        noise[c] = slope[c] * (np.floor(rest + away) - rest)
 
 
 @njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -284,12 +252,12 @@ def _divide(first: Any, second: Any, out: Any) -> None:
 
 
 @njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _count_quanta(mean: Any, slope: Any, step: Any, level: Any, quanta: Any) -> None:
-    """Mean number of effective quanta, variance over squared step, and the level of 0 or more that makes them."""
+def _count_quanta(mean: Any, slope: Any, quanta: Any) -> None:
+    """Mean number of quanta: variance over the square of a quantum, of a signal of 0 or more."""
     for c in range(len(quanta)):
-        level[c] = max(mean[c], np.float32(0.0))
+        quanta[c] = max(mean[c], np.float32(0.0))
     for c in range(len(quanta)):
-        quanta[c] = min(level[c] * slope[c] / (step[c] * step[c]), _MOST)
+        quanta[c] = min(quanta[c] * slope[c] / (slope[c] * slope[c]), _MOST)
 
 
 @njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -301,9 +269,15 @@ def _scale_normals(white_fraction: Any, slope: Any, gains: Any, mean: Any, read:
 
 
 @njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _add_up(signal_share: Any, mean: Any, noise: Any, gains: Any, normals: Any, dark: Any, out: Any) -> None:
+def _multiply(factor: Any, out: Any) -> None:
     for c in range(len(out)):
-        out[c] = (signal_share * mean[c] + noise[c] * gains[c]) + (normals[c] + dark[c])
+        out[c] *= factor[c]
+
+
+@njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _add_up(mean: Any, noise: Any, normals: Any, dark: Any, out: Any) -> None:
+    for c in range(len(out)):
+        out[c] = (mean[c] + noise[c]) + (normals[c] + dark[c])
 
 
 @njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -314,13 +288,9 @@ def _quanta_band(
     signal: Any,
     relative: Any,
     slope: Any,
-    step: Any,
-    excess: Any,
     kernel: Any,
-    signal_kernel: Any,
     reach: Any,
     noise_out: Any,
-    signal_out: Any,
 ) -> None:
     rows, columns = signal.shape
     total = len(noise_out)
@@ -329,35 +299,29 @@ def _quanta_band(
     level = np.empty(wide, np.float32)
     gains = np.empty(wide, np.float32)
     slopes = np.empty(wide, np.float32)
-    steps = np.empty(wide, np.float32)
-    excesses = np.empty(wide, np.float32)
     quanta = np.empty(wide, np.float32)
     # the kernel is padded to a multiple of taps; zeros stand beyond the row
     noise = np.zeros(wide + TAPS_TOGETHER, np.float32)
-    mean = np.zeros(wide + TAPS_TOGETHER, np.float32)
+    mean = np.empty(wide, np.float32)
     for i in range(band * _BAND, min(band * _BAND + _BAND, total)):
         row = min(max(i - reach, 0), rows - 1)
         _row_of(signal, row, level, reach)
         _row_of(relative, row, gains, reach)
         _row_of(slope, row, slopes, reach)
-        _row_of(step, row, steps, reach)
-        _divide(level, gains, mean[:wide])
-        _count_quanta(mean, slopes, steps, level, quanta)
+        _divide(level, gains, mean)
+        _count_quanta(mean, slopes, quanta)
         few = np.int32(0)
         for c in range(wide):
             few = np.int32(few + np.int32(quanta[c] < _FROM))
         _fill_normals(key, frame, STAGE_QUANTA, i, words, noise[: wide + wide % 2])
-        _draw_many(quanta, steps, noise[:wide])
+        _draw_many(quanta, slopes, noise[:wide])
         if few > 0:
-            _row_of(excess, row, excesses, reach)
-            _draw_few(key, frame, i, quanta, level, slopes, steps, excesses, words, noise[:wide])
+            _draw_few(key, frame, i, quanta, slopes, words, noise[:wide])
         if len(kernel) > 1:
             _convolve(noise, kernel, noise_out[i])
         else:
             for c in range(columns):
                 noise_out[i, c] = noise[c]
-        if len(signal_kernel) > 0:
-            _convolve(mean, signal_kernel, signal_out[i])
 
 
 @njit(parallel=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -367,18 +331,13 @@ def fill_quanta(
     signal: Any,
     relative: Any,
     slope: Any,
-    step: Any,
-    excess: Any,
     kernel: Any,
-    signal_kernel: Any,
     reach: Any,
     noise_out: Any,
-    signal_out: Any,
 ) -> None:
     """Quantum noise of rows -reach .. rows + reach, spread along the rows: noise_out (rows + 2 reach, columns).
 
-    With a signal_kernel also the signal over the relative gain, spread along the rows: signal_out of the same shape. Maps
-    are (rows or 1, columns or 1); outside the image the edge's values stand.
+    Maps are (rows or 1, columns or 1); outside the image the edge's values stand.
     """
     for band in prange((len(noise_out) + _BAND - 1) // _BAND):
         _quanta_band(
@@ -388,13 +347,9 @@ def fill_quanta(
             signal,
             relative,
             slope,
-            step,
-            excess,
             kernel,
-            signal_kernel,
             reach,
             noise_out,
-            signal_out,
         )
 
 
@@ -410,11 +365,8 @@ def _frame_band(
     read_variance: Any,
     dark: Any,
     kernel: Any,
-    signal_kernel: Any,
     noise_rows: Any,
-    signal_rows: Any,
     electronics: Any,
-    signal_share: Any,
     steps_a_DN: Any,
     lowest: Any,
     highest: Any,
@@ -439,17 +391,13 @@ def _frame_band(
         else:
             for c in range(columns):
                 noise[c] = noise_rows[row, c]
-        if len(signal_kernel) > 0:
-            _convolve_down(signal_rows, row, signal_kernel, mean)
-            for c in range(columns):
-                mean[c] *= gains[c]
-        else:
-            _row_of(signal, row, mean, 0)
+        _row_of(signal, row, mean, 0)
         if electronics:
             _fill_normals(key, frame, STAGE_ELECTRONICS, row, words, normals[: columns + columns % 2])
         one = out[row]
         _scale_normals(white_fraction, slopes, gains, mean, reads, normals)
-        _add_up(signal_share, mean, noise, gains, normals, darks, one)
+        _multiply(gains, noise)
+        _add_up(mean, noise, normals, darks, one)
         if steps_a_DN > 0:
             step = np.float32(1.0) / steps_a_DN
             for c in range(columns):
@@ -469,11 +417,8 @@ def fill_frame(
     read_variance: Any,
     dark: Any,
     kernel: Any,
-    signal_kernel: Any,
     noise_rows: Any,
-    signal_rows: Any,
     electronics: Any,
-    signal_share: Any,
     steps_a_DN: Any,
     lowest: Any,
     highest: Any,
@@ -481,7 +426,7 @@ def fill_frame(
 ) -> None:
     """Spread along the columns, add white noise, electronics and dark, digitise; out (rows, columns).
 
-    steps_a_DN 0 leaves the result unrounded; noise_rows and signal_rows come from fill_quanta.
+    steps_a_DN 0 leaves the result unrounded; noise_rows come from fill_quanta.
     """
     for band in prange((len(out) + _BAND - 1) // _BAND):
         _frame_band(
@@ -495,11 +440,8 @@ def fill_frame(
             read_variance,
             dark,
             kernel,
-            signal_kernel,
             noise_rows,
-            signal_rows,
             electronics,
-            signal_share,
             steps_a_DN,
             lowest,
             highest,

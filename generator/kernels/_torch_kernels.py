@@ -21,9 +21,8 @@ from ._noise_constants import (
     MOST_QUANTA,
     MULTIPLIERS,
     STAGE_ELECTRONICS,
-    STAGE_FIRST_DEPOSIT,
+    STAGE_FEW_QUANTA,
     STAGE_QUANTA,
-    STAGE_SECOND_DEPOSIT,
     STEP_64,
     STRIDE,
 )
@@ -126,8 +125,8 @@ def normals(keys: Any, columns: int) -> Any:
     return torch.sqrt(-2.0 * torch.log(uniform)) * torch.where(is_second, torch.sin(turn), torch.cos(turn))
 
 
-def many_quanta(quanta: Any, step: Any, w: Any) -> Any:
-    """step x (Poisson count - mean) from normal numbers w, for means of EXPANSION_FROM or more (see _numba_kernels)."""
+def many_quanta(quanta: Any, slope: Any, w: Any) -> Any:
+    """slope x (Poisson count - mean) from normal numbers w, for means of EXPANSION_FROM or more (see _numba_kernels)."""
     import torch
 
     mean = torch.clamp(quanta, min=EXPANSION_FROM)
@@ -138,7 +137,7 @@ def many_quanta(quanta: Any, step: Any, w: Any) -> Any:
     away = away - part * w * (1.0 / 36.0 + square * (1.0 / 72.0))
     away = away + part * part * (-8.0 / 405.0 + square * (7.0 / 810.0 + square * (1.0 / 270.0)))
     rest = mean - torch.floor(mean)
-    return step * (torch.floor(rest + away) - rest)
+    return slope * (torch.floor(rest + away) - rest)
 
 
 def _inverted(words: Any, mean: Any) -> Any:
@@ -158,33 +157,17 @@ def _inverted(words: Any, mean: Any) -> Any:
     return count
 
 
-def few_quanta(level: Any, slope: Any, step: Any, excess: Any, quanta: Any, words: Any) -> Any:
-    """Noise (number,) of pixels of few quanta, float32: see _numba_kernels; `words` gives those of a stage."""
+def few_quanta(slope: Any, quanta: Any, words: Any) -> Any:
+    """Noise (number,) of pixels of few quanta, float32: see _numba_kernels."""
     import torch
 
-    level, slope, step, excess, quanta = (one.to(torch.float64) for one in (level, slope, step, excess, quanta))
-    compound = excess > 0
-    second = 1.0 + torch.where(compound, excess, 1.0)
-    third = step / slope * second * second
-    total = (third - second) / (second - 1.0)
-    middle = 0.5 * total
-    apart = torch.sqrt(torch.clamp(middle * middle - (total - second), min=0.0))
-    small, large = torch.clamp(middle - apart, min=0.0), middle + apart
-    share = (1.0 - small) / (large - small)
-    photons = second * level / slope
-    one = slope / second
-    means = (torch.where(compound, photons * share, quanta), torch.where(compound, photons * (1.0 - share), 0.0))
-    worths = (torch.where(compound, one * large, step), one * small)
-    noise = torch.zeros_like(level)
-    stages = (STAGE_FIRST_DEPOSIT, STAGE_SECOND_DEPOSIT) if bool(compound.any()) else (STAGE_FIRST_DEPOSIT,)
-    for mean, worth, stage in zip(means, worths, stages, strict=False):
-        noise += (_inverted(words(stage), mean) - mean) * worth
-    return noise.to(torch.float32)
+    slope, mean = slope.to(torch.float64), quanta.to(torch.float64)
+    return ((_inverted(words, mean) - mean) * slope).to(torch.float32)
 
 
-def _draw_many(keys: Any, quanta: Any, step: Any, wide: int) -> Any:
+def _draw_many(keys: Any, quanta: Any, slope: Any, wide: int) -> Any:
     """Noise (frame, row, wide) of rows whose keys are given, for pixels of many quanta."""
-    return many_quanta(quanta, step, normals(keys, wide))
+    return many_quanta(quanta, slope, normals(keys, wide))
 
 
 def _read_out(
@@ -195,14 +178,14 @@ def _read_out(
     slope: Any,
     read_variance: Any,
     dark: Any,
-    numbers: tuple[float, float, float, float, float],
+    numbers: tuple[float, float, float, float],
 ) -> Any:
     """Frames from spread signal and noise; keys None: no electronics; numbers: see `_sample_piece`."""
     import torch
 
-    white_fraction, signal_share, steps_a_DN, lowest, highest = numbers
+    white_fraction, steps_a_DN, lowest, highest = numbers
     columns = signal.shape[-1]
-    frame = signal_share * signal + noise * relative
+    frame = signal + noise * relative
     if keys is not None:
         drawn = normals(keys, columns)
         white = white_fraction * slope * relative * torch.clamp(signal, min=0.0)
@@ -234,7 +217,7 @@ def sample(request: Frames, *, device: str | None, fused: bool = False) -> Any:
     if result.numel() == 0:
         return result
     together = max(1, _PIXELS_AT_ONCE // (rows * columns))
-    names = ("signal", "relative", "slope", "step", "excess", "read_variance", "dark")
+    names = ("signal", "relative", "slope", "read_variance", "dark")
     whole = {name: on_device(getattr(request, name), where) for name in names}
     with torch.no_grad():
         for start in range(0, request.frames, together):
@@ -263,11 +246,10 @@ def _sample_piece(request: Frames, maps: dict[str, Any], frames: Any, *, fused: 
             return values
         return values.index_select(1, row_at).index_select(2, column_at)
 
-    relative, slope, step = (widened(maps[name]) for name in ("relative", "slope", "step"))
-    mean = widened(maps["signal"]) / relative
-    level = torch.clamp(mean, min=0.0)
-    quanta = torch.clamp(level * slope / (step * step), max=MOST_QUANTA)
-    noise = step_of("_draw_many")(row_keys(request.key, frames, STAGE_QUANTA, high), quanta, step, wide)
+    slope = widened(maps["slope"])
+    level = torch.clamp(widened(maps["signal"]) / widened(maps["relative"]), min=0.0)
+    quanta = torch.clamp(level * slope / (slope * slope), max=MOST_QUANTA)
+    noise = step_of("_draw_many")(row_keys(request.key, frames, STAGE_QUANTA, high), quanta, slope, wide)
     few = quanta < EXPANSION_FROM
     if bool(few.any()):
         shape = noise.shape
@@ -276,29 +258,16 @@ def _sample_piece(request: Frames, maps: dict[str, Any], frames: Any, *, fused: 
         def chosen(values: Any) -> Any:
             return values.expand(shape)[places]
 
-        def words(stage: int) -> Any:
-            column = torch.arange(wide, dtype=torch.int32, device=device)
-            return random_words(row_keys(request.key, frames, stage, high), column)[places]
-
-        excess = widened(maps["excess"])
-        noise[places] = few_quanta(chosen(level), chosen(slope), chosen(step), chosen(excess), chosen(quanta), words)
+        column = torch.arange(wide, dtype=torch.int32, device=device)
+        words = random_words(row_keys(request.key, frames, STAGE_FEW_QUANTA, high), column)
+        noise[places] = few_quanta(chosen(slope), chosen(quanta), words[places])
     if len(request.kernel) > 1 or reach:
         taps = tuple(float(tap) for tap in request.kernel[: 2 * reach + 1])
         noise = step_of("_spread_both")(noise, taps, rows, columns)
-    signal = maps["signal"]
-    if len(request.signal_kernel):
-        taps = tuple(float(tap) for tap in request.signal_kernel[: 2 * reach + 1])
-        signal = step_of("_spread_both")(mean, taps, rows, columns) * maps["relative"]
     keys = row_keys(request.key, frames, STAGE_ELECTRONICS, rows) if request.electronics else None
-    numbers = (
-        request.white_fraction,
-        request.signal_share,
-        request.steps_a_DN,
-        request.lowest,
-        request.highest,
-    )
+    numbers = (request.white_fraction, request.steps_a_DN, request.lowest, request.highest)
     return step_of("_read_out")(
-        keys, signal, noise, maps["relative"], maps["slope"], maps["read_variance"], maps["dark"], numbers
+        keys, maps["signal"], noise, maps["relative"], maps["slope"], maps["read_variance"], maps["dark"], numbers
     )
 
 

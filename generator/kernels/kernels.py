@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...errors import InputError
 from ._frames import FloatMap, Frames
-from ._noise_constants import LARGEST_INVERTED, TAPS_TOGETHER
+from ._noise_constants import TAPS_TOGETHER
 
 BACKENDS = ("cpu", "torch", "torch_compiled")
 _HIGHEST = 1e15  # DN: products of two of them still fit single precision
@@ -76,11 +76,9 @@ def _kernel(name: str, values: ArrayLike | None) -> FloatMap:
     return np.asarray(kernel[cut : len(kernel) - cut], dtype=np.float32)
 
 
-def _with_reach(kernel: FloatMap, reach: int) -> FloatMap:
-    """The kernel with zeros up to `reach` on both sides, and at the end up to a multiple of the taps taken together."""
-    missing = reach - len(kernel) // 2
-    length = 2 * reach + 1
-    return np.ascontiguousarray(np.pad(kernel, (missing, missing + -length % TAPS_TOGETHER)), dtype=np.float32)
+def _with_padding(kernel: FloatMap) -> FloatMap:
+    """The kernel with zeros at its end up to a multiple of the taps taken together."""
+    return np.pad(kernel, (0, -len(kernel) % TAPS_TOGETHER))
 
 
 def _check_number(name: str, value: float, *, low: float, high: float, unit: str) -> float:
@@ -93,12 +91,9 @@ def _prepare(
     signal_DN: ArrayLike,
     *,
     gain_DN: ArrayLike,
-    step_DN: ArrayLike | None,
-    deposit_spread: ArrayLike,
     gain_relative: ArrayLike,
     white_fraction: float,
     kernel_1d: ArrayLike | None,
-    signal_kernel_1d: ArrayLike | None,
     read_noise_DN: ArrayLike,
     dark_DN: ArrayLike,
     bits: int | None,
@@ -107,7 +102,6 @@ def _prepare(
     key: int,
     first_frame: int,
     frames: int | None,
-    with_signal: bool = True,
 ) -> Frames:
     given: Any = signal_DN if is_tensor(signal_DN) else np.asarray(signal_DN)
     if given.ndim not in (2, 3):
@@ -132,27 +126,17 @@ def _prepare(
     maps = {
         "signal": _map("signal_DN", given, shape, low=-_HIGHEST, unit="DN"),
         "gain": _map("gain_DN", gain_DN, shape, low=1e-12, unit="DN"),
-        "excess": _map("deposit_spread", deposit_spread, shape, low=0.0, unit=""),
         "relative": _map("gain_relative", gain_relative, shape, low=1e-6, high=1e6, unit=""),
         "read": _map("read_noise_DN", read_noise_DN, shape, low=0.0, unit="DN"),
         "dark": _map("dark_DN", dark_DN, shape, low=-_HIGHEST, unit="DN"),
     }
-    if step_DN is not None:
-        maps["step"] = _map("step_DN", step_DN, shape, low=1e-12, unit="DN")
     places = [values.device for values in maps.values() if is_tensor(values)]
     if places:
         from ._torch_kernels import on_device
 
         maps = {name: on_device(values, places[0]) for name, values in maps.items()}
-    slope, excess = maps["gain"] / float(1.0 + white), maps["excess"]
-    if step_DN is None:
-        step = slope * (1.0 + 2.0 * excess) / (1.0 + excess)  # of deposits that follow a gamma distribution
-    else:
-        step = maps["step"]
-        _check_deposits(slope, step, excess)
-    noise_kernel = _kernel("kernel_1d", kernel_1d)
-    signal_kernel = None if signal_kernel_1d is None else _kernel("signal_kernel_1d", signal_kernel_1d)
-    reach = max(len(noise_kernel), 0 if signal_kernel is None else len(signal_kernel)) // 2
+    kernel = _kernel("kernel_1d", kernel_1d)
+    reach = len(kernel) // 2
     read = maps["read"] ** 2 / averaged
     if quantised:
         # each of the averaged frames was rounded; rounding their mean to 1 / averaged DN gives 1 / averaged^2 of it
@@ -160,44 +144,20 @@ def _prepare(
     return Frames(
         signal=maps["signal"],
         relative=maps["relative"],
-        slope=_single(slope / averaged),
-        step=_single(step / averaged),
-        excess=excess,
+        slope=_single(maps["gain"] / float(1.0 + white) / averaged),
         read_variance=_single(read),
         dark=maps["dark"],
         white_fraction=white,
-        kernel=noise_kernel if reach == 0 and noise_kernel[0] == 1 else _with_reach(noise_kernel, reach),
-        signal_kernel=np.zeros(0, np.float32) if signal_kernel is None else _with_reach(signal_kernel, reach),
+        kernel=kernel if reach == 0 and kernel[0] == 1 else _with_padding(kernel),
         reach=reach,
         electronics=bool(white > 0 or (read > 0).any()),
         steps_a_DN=float(averaged) if quantised else 0.0,
         lowest=0.0 if quantised else -math.inf,
         highest=math.inf if bits is None else float(2**bits - 1),
-        signal_share=1.0 if with_signal else 0.0,
         key=int(key),
         first_frame=int(first_frame),
         frames=count,
     )
-
-
-def _check_deposits(slope: Any, step: Any, excess: Any) -> None:
-    """Deposits of 0 or more have E q^3 E q >= (E q^2)^2: the step is no smaller than the variance per signal."""
-    if not bool((excess > 0).any()):
-        return
-    ratio = step / slope
-    if not bool(((ratio >= 1.0 - 1e-6) | (excess <= 0)).all()):
-        raise InputError(
-            "step_DN",
-            received=f"{float(ratio.min()):g} of the quantum variance per signal",
-            expected="as much or more, for deposits of 0 or more",
-            remedy="leave step_DN out for deposits of a gamma distribution, or set deposit_spread to 0",
-        )
-    if not float((ratio**2 * (1.0 + excess)).max()) * 20.0 < LARGEST_INVERTED:
-        raise InputError(
-            "deposit_spread and step_DN",
-            received=f"up to {float(excess.max()):g}, and {float(ratio.max()):g} of the variance per signal",
-            expected="(step / variance per signal)^2 (1 + spread) below 30",
-        )
 
 
 def sample_frames(
@@ -207,15 +167,11 @@ def sample_frames(
     key: int,
     first_frame: int = 0,
     frames: int | None = None,
-    deposit_spread: ArrayLike = 0.0,
-    step_DN: ArrayLike | None = None,
     gain_relative: ArrayLike = 1.0,
     white_fraction: float = 0.0,
     kernel_1d: ArrayLike | None = None,
-    signal_kernel_1d: ArrayLike | None = None,
     read_noise_DN: ArrayLike = 0.0,
     dark_DN: ArrayLike = 0.0,
-    stuck_DN: ArrayLike | None = None,
     bits: int | None = None,
     quantised: bool = True,
     averaged: int = 1,
@@ -226,30 +182,24 @@ def sample_frames(
 
     Per pixel, r the relative gain, S the signal, a = gain / (1 + white_fraction), * the spread:
 
-        Q  = r (S / r * h_signal) + r ((X - E X) * h)     X compound Poisson of mean S / r, variance a S / r
+        Q  = S + r ((X - E X) * h)     X = a N, N a Poisson number of mean S / (r a)
         out = ADC(Q + sqrt(white_fraction a S r + read_noise^2) normal + dark)
 
-    X has the right mean, variance and third cumulant (`step_DN` times the variance) at any signal. Below 20 effective
-    quanta (variance over squared step) it is a sum of exact Poisson numbers of deposits of two sizes, which also has the
-    right number of photons, (1 + deposit_spread) S / (r a); above, one Poisson number by an expansion of its quantile.
-    Averaged frames: quanta and electronics of the mean of `averaged` frames, each rounded, in steps of 1 / averaged DN; of
-    frames that saturate the mean is not right.
+    Below a mean of 20, N is an exact Poisson number by inversion; above, one by an expansion of its quantile. Averaged
+    frames: quanta and electronics of the mean of `averaged` frames, each rounded, in steps of 1 / averaged DN; of frames
+    that saturate the mean is not right.
 
     Args:
-        signal_DN: mean above dark before the spread (row, column) or (frame, row, column), DN; negative counts as 0 quanta.
+        signal_DN: mean above dark, spread already (row, column) or (frame, row, column), DN; negative counts as 0 quanta.
         gain_DN: variance per signal with the spread's share restored, secondary quanta included, above 0 DN.
         key: from `draw_key`.
         first_frame: number of the first frame under this key; frame f of a piece is frame first_frame + f of the whole.
         frames: how many frames of one signal (row, column); None for one, without the frame axis.
-        deposit_spread: squared coefficient of variation of what a photon deposits; 0 for equal deposits.
-        step_DN: third cumulant over variance of the quanta, DN; None for deposits of a gamma distribution.
         gain_relative: the pixel's own gain over the detector median, above 0.
         white_fraction: signal-following white variance over quantum variance before the spread.
         kernel_1d: (2 R + 1,) per axis that correlates the noise, `psf.noise_kernel_1d`; None for no spread.
-        signal_kernel_1d: the same for the signal, `psf.optical_kernel_1d`; None where the signal is spread already.
         read_noise_DN: electronic noise of one frame without the ADC's rounding.
         dark_DN: mean without beam.
-        stuck_DN: value of pixels that show nothing else, NaN elsewhere (row, column), DN; None for none.
         bits: ADC range 0 .. 2^bits - 1; None for no upper end.
         quantised: whole DN (steps of 1 / averaged) from 0; otherwise neither rounded nor cut at 0.
         averaged: frames averaged in the detector.
@@ -269,12 +219,9 @@ def sample_frames(
     request = _prepare(
         signal_DN,
         gain_DN=gain_DN,
-        step_DN=step_DN,
-        deposit_spread=deposit_spread,
         gain_relative=gain_relative,
         white_fraction=white_fraction,
         kernel_1d=kernel_1d,
-        signal_kernel_1d=signal_kernel_1d,
         read_noise_DN=read_noise_DN,
         dark_DN=dark_DN,
         bits=bits,
@@ -286,7 +233,6 @@ def sample_frames(
     )
     return _sample(
         request,
-        _stuck(stuck_DN, request.signal.shape[-2:]),
         single=np.ndim(signal_DN) == 2 and frames is None,
         backend=backend,
         device=device,
@@ -300,7 +246,6 @@ def _check_backend(backend: str) -> None:
 
 def _sample(
     request: Frames,
-    stuck: tuple[tuple[Any, ...], NDArray[np.float32]] | None,
     *,
     single: bool,
     backend: str,
@@ -310,9 +255,6 @@ def _sample(
         from ._torch_kernels import sample
 
         result = sample(request, device=device, fused=backend == "torch_compiled")
-        if stuck is not None:
-            places = [result.new_tensor(axis).long() for axis in stuck[0]]
-            result[:, places[0], places[1]] = result.new_tensor(stuck[1])
     elif is_tensor(request.signal):
         raise InputError(
             "backend",
@@ -322,62 +264,7 @@ def _sample(
         )
     else:
         result = _sample_compiled(request)
-        if stuck is not None:
-            result[:, stuck[0][0], stuck[0][1]] = stuck[1]
     return result[0] if single else result
-
-
-def _stuck(stuck_DN: ArrayLike | None, shape: tuple[int, ...]) -> tuple[tuple[Any, ...], NDArray[np.float32]] | None:
-    if stuck_DN is None:
-        return None
-    values = np.asarray(stuck_DN, dtype=np.float64)
-    if values.shape != shape or np.any(np.isinf(values)):
-        raise InputError(
-            "stuck_DN", received=f"shape {values.shape}", expected=f"DN or NaN of shape {shape}, no infinity"
-        )
-    where = np.nonzero(~np.isnan(values))
-    return where, values[where].astype(np.float32)
-
-
-def sample_quanta(
-    signal_DN: ArrayLike,
-    *,
-    gain_DN: ArrayLike,
-    key: int,
-    first_frame: int = 0,
-    frames: int | None = None,
-    deposit_spread: ArrayLike = 0.0,
-    step_DN: ArrayLike | None = None,
-    kernel_1d: ArrayLike | None = None,
-    backend: str = "cpu",
-    device: str | None = None,
-) -> Any:
-    """Quantum noise of zero mean after the spread, without electronics or readout; shapes and DN of `sample_frames`.
-
-    For noise that later stages change (lag, nonlinearity) or that something else spreads (leave `kernel_1d` out), and for
-    top-ups: gain the missing variance per signal, step the third cumulant over it.
-    """
-    _check_backend(backend)
-    request = _prepare(
-        signal_DN,
-        gain_DN=gain_DN,
-        step_DN=step_DN,
-        deposit_spread=deposit_spread,
-        gain_relative=1.0,
-        white_fraction=0.0,
-        kernel_1d=kernel_1d,
-        signal_kernel_1d=None,
-        read_noise_DN=0.0,
-        dark_DN=0.0,
-        bits=None,
-        quantised=False,
-        averaged=1,
-        key=key,
-        first_frame=first_frame,
-        frames=frames,
-        with_signal=False,
-    )
-    return _sample(request, None, single=np.ndim(signal_DN) == 2 and frames is None, backend=backend, device=device)
 
 
 def _sample_compiled(request: Frames) -> NDArray[np.float32]:
@@ -388,7 +275,6 @@ def _sample_compiled(request: Frames) -> NDArray[np.float32]:
     if result.size == 0:
         return result
     noise_rows = np.empty((rows + 2 * request.reach, columns), dtype=np.float32)
-    signal_rows = np.empty_like(noise_rows) if len(request.signal_kernel) else np.empty((0, 0), dtype=np.float32)
     key = np.uint64(request.key)
     for frame in range(request.frames):
         signal, relative = request.of("signal", frame), request.of("relative", frame)
@@ -399,13 +285,9 @@ def _sample_compiled(request: Frames) -> NDArray[np.float32]:
             signal,
             relative,
             slope,
-            request.of("step", frame),
-            request.of("excess", frame),
             request.kernel,
-            request.signal_kernel,
             request.reach,
             noise_rows,
-            signal_rows,
         )
         fill_frame(
             key,
@@ -417,11 +299,8 @@ def _sample_compiled(request: Frames) -> NDArray[np.float32]:
             request.of("read_variance", frame),
             request.of("dark", frame),
             request.kernel,
-            request.signal_kernel,
             noise_rows,
-            signal_rows,
             request.electronics,
-            np.float32(request.signal_share),
             np.float32(request.steps_a_DN),
             np.float32(request.lowest),
             np.float32(request.highest),

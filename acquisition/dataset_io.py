@@ -477,23 +477,17 @@ def write_selected(
     *,
     selection: Selection,
     split: str | None = None,
-    provenance: Mapping[str, Any] | None = None,
 ) -> None:
     """Write some pairs of a dataset, in the order given, to a dataset file of their own.
 
     Args:
         selection: numbers, a slice or flags (n,).
         split: give all of them this split; None keeps theirs.
-        provenance: added to the source's own attributes.
     """
-    _write_pairs(
-        path, [(dataset, int(number)) for number in dataset._numbers(selection)], split=split, provenance=provenance
-    )
+    _write_pairs(path, [(dataset, int(number)) for number in dataset._numbers(selection)], split=split)
 
 
-def concatenate_datasets(
-    datasets: Iterable[Dataset], path: str | os.PathLike[str], *, provenance: Mapping[str, Any] | None = None
-) -> None:
+def concatenate_datasets(datasets: Iterable[Dataset], path: str | os.PathLike[str]) -> None:
     """Write all pairs of several datasets, one after the other, to one dataset file.
 
     Images in DN are kept only where every dataset holds them.
@@ -502,7 +496,7 @@ def concatenate_datasets(
         InputError: images of different shapes, or no dataset.
     """
     pairs = [(dataset, number) for dataset in datasets for number in range(len(dataset))]
-    _write_pairs(path, pairs, split=None, provenance=provenance)
+    _write_pairs(path, pairs, split=None)
 
 
 def _write_pairs(
@@ -510,7 +504,6 @@ def _write_pairs(
     pairs: Sequence[tuple[Dataset, int]],
     *,
     split: str | None,
-    provenance: Mapping[str, Any] | None,
 ) -> None:
     if not pairs:
         raise InputError(str(path), received="no images", expected="at least one image pair to write")
@@ -524,7 +517,7 @@ def _write_pairs(
         )
     kept = dict(first.attributes) if all(dataset is first for dataset, _ in pairs) else {}
     with_counts = all(dataset.has_counts for dataset, _ in pairs)
-    with write_dataset(path, shape=first.shape, provenance={**kept, **(provenance or {})}) as writer:
+    with write_dataset(path, shape=first.shape, provenance=kept) as writer:
         for dataset, number in pairs:
             row = dataset.rows[number]
             writer.append(

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,7 +63,6 @@ def import_folder(
     out: str | os.PathLike[str],
     *,
     layout: str,
-    progress: Callable[[int, int], None] | None = None,
 ) -> ImportReport:
     """Import what `layout_of` recognised, without further options; of a folder of images the series that can be read.
 
@@ -73,27 +72,27 @@ def import_folder(
     if layout == "images":
         from .images import import_images
 
-        return import_images(source, out, without_damaged=True, progress=progress)
+        return import_images(source, out, without_damaged=True)
     if layout == "emva1288":
         from .emva1288 import import_emva1288
 
-        return import_emva1288(source, out, progress=progress)
+        return import_emva1288(source, out)
     if layout == "nxtomo":
         from .nxtomo import import_nxtomo
 
-        return import_nxtomo(source, out, progress=progress)
+        return import_nxtomo(source, out)
     if layout == "dicom":
         from .dicom import import_dicom
 
-        return import_dicom(source, out, progress=progress)
+        return import_dicom(source, out)
     if layout == "xtekct":
         from .xtekct import import_xtekct
 
-        return import_xtekct(source, out, progress=progress)
+        return import_xtekct(source, out)
     if layout == "zenodo":
         from .zenodo import import_zenodo
 
-        return import_zenodo(source, out, progress=progress)
+        return import_zenodo(source, out)
     raise InputError("layout", received=repr(layout), expected="images, emva1288, nxtomo, dicom, xtekct or zenodo")
 
 

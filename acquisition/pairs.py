@@ -18,16 +18,17 @@ from .scenes import Scene
 from .setting import Setting
 
 _SAME = 1e-6
+_LEAST_SIGNAL_DN = 1.0
 
 
 def flat_corrected_log(
-    counts_DN: NDArray[Any], *, dark_DN: NDArray[Any] | float, flat_DN: NDArray[Any], minimum_DN: float = 1.0
+    counts_DN: NDArray[Any], *, dark_DN: NDArray[Any] | float, flat_DN: NDArray[Any]
 ) -> NDArray[np.float32]:
     """-log(I/I0) (dimensionless) of raw detector numbers.
 
-    Equation: M = -log(max(I - D, m) / max(F - D, m)), with I `counts_DN`, D `dark_DN`, F `flat_DN`, m `minimum_DN`.
+    Equation: M = -log(max(I - D, m) / max(F - D, m)), with I `counts_DN`, D `dark_DN`, F `flat_DN`, m = 1 DN.
 
-    Validity: signals below `minimum_DN` above dark are set to it, so that M stays finite behind opaque objects: there M
+    Validity: signals below 1 DN above dark are set to it, so that M stays finite behind opaque objects: there M
     is a lower bound, at most log((F - D) / m). A pixel whose flat does not rise above the dark (a dead one) gives 0 or
     less; replace such pixels with `replace_bad_pixels`. At few photons -log is biased upwards by var / (2 mean^2).
 
@@ -35,16 +36,13 @@ def flat_corrected_log(
         counts_DN: (..., row, column) raw frames, dark included.
         dark_DN: (row, column) mean of darks of the same exposure time.
         flat_DN: (row, column) mean of flats of the same setting, dark included.
-        minimum_DN: smallest signal, above 0 DN.
 
     Returns:
         (..., row, column) float32.
     """
-    if not minimum_DN > 0:
-        raise InputError("minimum_DN", received=minimum_DN, expected="a signal above 0 DN")
     dark = np.asarray(dark_DN, dtype=np.float64)
-    open_field_DN = np.maximum(np.asarray(flat_DN, dtype=np.float64) - dark, minimum_DN)
-    signal_DN = np.maximum(np.asarray(counts_DN, dtype=np.float64) - dark, minimum_DN)
+    open_field_DN = np.maximum(np.asarray(flat_DN, dtype=np.float64) - dark, _LEAST_SIGNAL_DN)
+    signal_DN = np.maximum(np.asarray(counts_DN, dtype=np.float64) - dark, _LEAST_SIGNAL_DN)
     return np.asarray(-np.log(signal_DN / open_field_DN), dtype=np.float32)
 
 
@@ -337,7 +335,6 @@ def dataset_from_acquisition(
     *,
     low: Setting | None = None,
     high: Setting | None = None,
-    contrast_from: tuple[Setting, Setting] | None = None,
     with_counts: bool = True,
     split: str | Mapping[str, str] | None = None,
     each_frame: bool = False,
@@ -349,15 +346,13 @@ def dataset_from_acquisition(
     """Write the object pairs of one setting pair to a dataset file, with their masks and contrasts.
 
     A scene needs a `foreign_object_mask` (an empty one says: no foreign object); without a `product_mask` the product
-    is where M_low > 0.1 in the pair the contrast comes from.
+    is where M_low > 0.1 in the pair the contrast comes from: the scene's with the longest exposure.
 
     Args:
         acquisition: open acquisition file with objects, and darks and flats at their settings.
         out: dataset file to write.
         low, high: settings of the pair; None where the acquisition holds one pair of settings only. Tube current,
             power and distance are compared only where they are given, filters where that leaves a pair.
-        contrast_from: settings of the low-noise pair that contrasts are computed from; None takes, for each scene, the
-            pair with the longest exposure.
         with_counts: keep the raw frames (DN, dark included) beside the log images.
         split: one split for all, or scene -> split; None takes the scene's attribute `split`, else `test`.
         each_frame: every frame makes an image of its own; otherwise the frames of a series are averaged.
@@ -420,7 +415,7 @@ def dataset_from_acquisition(
     stated = {"pixel_mm": acquisition.instrument.pixel_mm, **(provenance or {})}
     with write_dataset(out, shape=usable[0][0].low.shape, provenance=stated) as writer:
         for done, (pair, scene) in enumerate(usable):
-            reference = _reference(pairs, pair, contrast_from)
+            reference = _reference(pairs, pair)
             truth = _truth(corrector, reference, scene, dilations=dilations, notes=notes)
             for counts, frames in _images_of(pair, each_frame=each_frame):
                 image = np.stack(
@@ -504,21 +499,10 @@ def _images_of(pair: ObjectPair, *, each_frame: bool) -> list[tuple[NDArray[np.f
     ]
 
 
-def _reference(
-    pairs: Sequence[ObjectPair], pair: ObjectPair, contrast_from: tuple[Setting, Setting] | None
-) -> ObjectPair:
-    """The pair of the same scene with the least noise, or the one at the settings asked for."""
+def _reference(pairs: Sequence[ObjectPair], pair: ObjectPair) -> ObjectPair:
+    """The pair of the same scene with the least noise."""
     candidates = [other for other in pairs if other.scene == pair.scene and other.low.shape == pair.low.shape]
-    if contrast_from is None:
-        return max(candidates, key=lambda other: other.seconds)
-    fitting = _choose(candidates, *contrast_from)
-    if fitting:
-        return max(fitting, key=lambda other: other.seconds)
-    raise InputError(
-        f"contrast of scene {pair.scene}",
-        received="no pair at " + ";".join(str(setting) for setting in contrast_from),
-        expected="one of " + " | ".join(_text(other) for other in candidates),
-    )
+    return max(candidates, key=lambda other: other.seconds)
 
 
 def _choose(pairs: Sequence[ObjectPair], low: Setting | None, high: Setting | None) -> list[ObjectPair]:

@@ -72,9 +72,9 @@ def classes_of(effects: Sequence[str]) -> tuple[str, ...]:
     return (NONE, UNKNOWN, *effects)
 
 
-def answered(outcome: Outcome, probability: Mapping[str, float], *, top1: str | None = None) -> Outcome:
+def answered(outcome: Outcome, probability: Mapping[str, float]) -> Outcome:
     """The outcome had the answer been these probabilities of classes."""
-    first = top1 or max(probability, key=lambda name: probability[name])
+    first = max(probability, key=lambda name: probability[name])
     ranked = sorted(probability, key=lambda name: -probability[name])
     kept: list[str] = []
     total = 0.0

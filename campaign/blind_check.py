@@ -110,11 +110,10 @@ class OpenedCheck:
 class Processes:
     """Measuring and diagnosing in processes of their own; `stop` ends those that run."""
 
-    def __init__(self, options: BlindOptions, *, code: Path | None = None, timeout_s: float = CASE_TIMEOUT_S) -> None:
+    def __init__(self, options: BlindOptions, *, code: Path | None = None) -> None:
         """`code`: folder of the frozen package (None: as it is installed)."""
         self._options = options
         self._code = code
-        self._timeout_s = timeout_s
         self._children = Children()
 
     def work(self) -> Work:
@@ -164,7 +163,7 @@ class Processes:
 
         def once() -> None:
             self._children.run(
-                module, words, given=given, environment=environment, folder=folder, timeout_s=self._timeout_s
+                module, words, given=given, environment=environment, folder=folder, timeout_s=CASE_TIMEOUT_S
             )
 
         try:

@@ -211,14 +211,14 @@ def _triple(value: Mapping[str, float] | None) -> tuple[float, float, float] | N
     return value["value"], value["low"], value["high"]
 
 
-def wilson_interval(hits: int, n: int, *, z: float = Z95) -> tuple[float, float]:
-    """Wilson's score interval of a proportion.
+def wilson_interval(hits: int, n: int) -> tuple[float, float]:
+    """Wilson's 95 % score interval of a proportion.
 
     Source: Wilson, J. Am. Stat. Assoc. 22 (1927) 209; Brown, Cai & DasGupta, Stat. Sci. 16 (2001) 101.
     """
     if n == 0:
         return 0.0, 1.0
-    p = hits / n
+    z, p = Z95, hits / n
     centre = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
     return max(centre - half, 0.0), min(centre + half, 1.0)

@@ -30,9 +30,9 @@ _VALIDATION_EVERY = 8
 _TRIES = 200
 
 
-def read_starter_plan(path: Path = STARTER_FOLDER / "starter.toml") -> dict[str, Any]:
+def read_starter_plan() -> dict[str, Any]:
     """What the starter learns from, as its TOML file says."""
-    return tomllib.loads(path.read_text(encoding="utf-8"))
+    return tomllib.loads((STARTER_FOLDER / "starter.toml").read_text(encoding="utf-8"))
 
 
 def make_starter_line(plan: Mapping[str, Any], number: int, folder: Path) -> Path:

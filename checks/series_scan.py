@@ -1,7 +1,6 @@
 """One pass over the frames of a series, in pieces: all that `check` asks of them, in memory that does not grow with it."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,15 +41,12 @@ class SeriesScan:
         return bool(self.values.size and (self.values == self.values.flat[0]).all() and np.ptp(self.frame_mean_DN) == 0)
 
 
-def scan_series(
-    series: Series, *, unsteady: NDArray[np.bool_] | None = None, progress: Callable[[int], None] | None = None
-) -> SeriesScan:
+def scan_series(series: Series, *, unsteady: NDArray[np.bool_] | None = None) -> SeriesScan:
     """Read a series once.
 
     Args:
         series: of an open acquisition.
         unsteady: pixels (row, column) whose noise is no sign of another scene.
-        progress: called with the number of frames read so far.
 
     Raises:
         FileFormatError: frames that cannot be read or hold values that are not finite.
@@ -81,8 +77,6 @@ def scan_series(
             if last_sample is not None and not np.array_equal(values, last_sample):
                 squares.append(_variance_of_change(last_sample, values))
             last_sample = values
-        if progress is not None:
-            progress(len(means))
     mean_DN = total / len(means)
     return SeriesScan(
         series=series,

@@ -69,16 +69,13 @@ def _request(rng: np.random.Generator, name: str) -> EffectRequest:
     return EffectRequest(id=name, strength=strength, since=since)
 
 
-def draw_case(
-    rng: np.random.Generator, *, label: str | None = None, names: tuple[str, ...] | None = None, reduced: bool = True
-) -> Case:
-    """A case for a blind check.
+def draw_case(rng: np.random.Generator, *, label: str | None = None, names: tuple[str, ...] | None = None) -> Case:
+    """A case for a blind check; some lack a part of the measurement set.
 
     Args:
         rng: draws it.
         label: of `LABELS`; None draws one.
         names: the catalogue's effects to draw from; None: all of them.
-        reduced: some cases may lack a part of the measurement set.
     """
     if label is None:
         label = str(rng.choice(list(LABELS), p=list(LABELS.values())))
@@ -96,7 +93,7 @@ def draw_case(
     geometry = either if wants_fine == wants_coarse else "fine" if wants_fine else "coarse"
     protocol = "full"
     leave_out: tuple[str, ...] = ()
-    if reduced and rng.random() < REDUCED:
+    if rng.random() < REDUCED:
         way = rng.random()
         if way < 0.3:
             protocol = "short"

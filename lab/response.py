@@ -234,8 +234,6 @@ def compute_incidence(
     kV: float,
     filters: tuple[Filter, ...],
     materials: tuple[str, ...] = (),
-    energy_groups: int = ENERGY_GROUPS,
-    deposit_classes: int = DEPOSIT_CLASSES,
 ) -> Incidence:
     """The beam of a system at a kV and filter in sampling classes.
 
@@ -244,11 +242,8 @@ def compute_incidence(
         kV: as set.
         filters: as set.
         materials: what objects are made of.
-        energy_groups, deposit_classes: how finely; see `Incidence` for the error of the defaults.
     """
-    return _incidence(
-        system, float(kV), tuple(filters), tuple(materials), min(energy_groups, 4000), min(deposit_classes, 4000)
-    )
+    return _incidence(system, float(kV), tuple(filters), tuple(materials))
 
 
 @lru_cache(maxsize=32)
@@ -257,8 +252,6 @@ def _incidence(
     kV: float,
     filters: tuple[Filter, ...],
     materials: tuple[str, ...],
-    energy_groups: int,
-    deposit_classes: int,
 ) -> Incidence:
     light = beam_of(system, kV=kV, filters=filters)
     photons = photons_per_pixel_mAs(system, light)
@@ -277,7 +270,7 @@ def _incidence(
     # Groups hold equal shares of the detected energy, half counted in the open beam, half behind the typical object.
     open_signal, typical_signal = photons * energy_signal, typical * energy_signal
     group = _edges_of_equal_share(
-        open_signal / open_signal.sum() + typical_signal / typical_signal.sum(), energy_groups
+        open_signal / open_signal.sum() + typical_signal / typical_signal.sum(), ENERGY_GROUPS
     )
     n_groups = int(group[-1]) + 1
     in_group: Array = np.bincount(group, photons, n_groups).astype(np.float64)
@@ -295,7 +288,7 @@ def _incidence(
     spread = typical_rate * deposits.deposit_keV**2
     steps = np.diff(deposits.deposit_keV[order], prepend=0.0)
     klass = np.empty(order.size, dtype=np.intp)
-    klass[order] = _edges_of_equal_share(spread[order] / spread.sum() + steps / steps.sum(), deposit_classes)
+    klass[order] = _edges_of_equal_share(spread[order] / spread.sum() + steps / steps.sum(), DEPOSIT_CLASSES)
     n_classes = int(klass.max()) + 1
     deposit_keV = np.bincount(klass, typical_rate * deposits.deposit_keV**2, n_classes) / np.bincount(
         klass, typical_rate * deposits.deposit_keV, n_classes

@@ -80,12 +80,12 @@ def detect_npwe(energy: FloatArray, amplitude: FloatArray, power: FloatArray, bi
     return _filtered(energy, power, bins, eye_filter(np.hypot(bins.row, bins.column)))
 
 
-def eye_filter(frequency: FloatArray, *, pixels_per_degree: float = PIXELS_PER_DEGREE) -> FloatArray:
+def eye_filter(frequency: FloatArray) -> FloatArray:
     """Contrast sensitivity of the eye (of the shape of `frequency`, cycles per pixel), 1 at its largest.
 
-    E = f exp(-b f) with f in cycles per degree and b = 0.25 degree. Source: ICRU Report 54; Burgess 1994.
+    E = f exp(-b f) with f in cycles per degree, at 35 pixels a degree, and b = 0.25 degree. Source: ICRU Report 54; Burgess 1994.
     """
-    per_degree = frequency * pixels_per_degree
+    per_degree = frequency * PIXELS_PER_DEGREE
     return np.asarray(per_degree * _EYE_DEGREE * np.exp(1.0 - _EYE_DEGREE * per_degree))
 
 

@@ -159,19 +159,17 @@ class LineImages:
         product_material: str,
         foreign_material: str,
         size: str = "contrast",
-        displaces: bool = True,
     ) -> ForeignObjects:
         """Objects of reference images with the thicknesses that their contrasts stand for.
 
-        The product's thickness follows from M_high around the object; the object's is that whose Delta R, at the references'
-        setting, is the contrast, taken as the same over the mask.
+        The object takes the product's place. The product's thickness follows from M_high around the object; the object's is
+        that whose Delta R, at the references' setting, is the contrast, taken as the same over the mask.
 
         Args:
             references: of `objects_of_references`.
             pair: setting of the references.
             product_material, foreign_material: what they are of.
             size: `contrast` or `size_mm`.
-            displaces: the object takes the product's place.
 
         Raises:
             InputError: contrasts that the materials cannot make, sizes that are not known.
@@ -186,7 +184,7 @@ class LineImages:
         thickness = product_mm[:, None] * share
         flat = (np.repeat(product_mm, share.size), thickness.ravel())
         contrasts = self.quotient_of(
-            pair, (product_material, foreign_material), product_mm=flat[0], object_mm=flat[1], displaces=displaces
+            pair, (product_material, foreign_material), product_mm=flat[0], object_mm=flat[1], displaces=True
         ).reshape(thickness.shape)
         contrasts *= math.copysign(1.0, float(np.median(contrasts[:, -1])))
         if not np.all(np.max(contrasts, axis=1) >= references.contrast):
@@ -215,7 +213,7 @@ class LineImages:
             area_px=references.area_px,
             product_material=product_material,
             foreign_material=foreign_material,
-            displaces=displaces,
+            displaces=True,
             sampled=True,
         )
 

@@ -69,15 +69,12 @@ class ReferenceObjects:
     setting: str
 
 
-def objects_of_references(
-    dataset: Dataset, *, pixel_mm: float, numbers: Sequence[int] | None = None
-) -> ReferenceObjects:
+def objects_of_references(dataset: Dataset, *, pixel_mm: float) -> ReferenceObjects:
     """Masks, contrasts and surroundings of the foreign objects of a dataset, those of known contrast above 0.
 
     Args:
         dataset: low-noise images with masks.
         pixel_mm: pitch; the ring around an object is 3.2 mm wide.
-        numbers: images to take; None: all.
 
     Raises:
         InputError: fewer than five such objects, or images of several settings or of another pitch.
@@ -85,11 +82,9 @@ def objects_of_references(
     from scipy.ndimage import binary_dilation, find_objects
 
     dataset.refuse_other_pitch(pixel_mm)
-    chosen = range(len(dataset)) if numbers is None else numbers
     names, contrast, size_mm, ring_log, masks, area = [], [], [], [], [], []
     settings = set()
-    for number in chosen:
-        row = dataset.rows[number]
+    for number, row in enumerate(dataset.rows):
         if not row.foreign_object or not (math.isfinite(row.contrast) and row.contrast > 0):
             continue
         mask, (low, high) = dataset.foreign_object_masks(number), dataset.images(number)

@@ -111,9 +111,9 @@ def curve_rows(fit: PodFit, *, points: int = 101) -> dict[str, Array]:
     return {"size": size, "pod": pod, "low": low, "high": high}
 
 
-def write_curve_table(path: str | os.PathLike[str], fit: PodFit, *, size_name: str = "size", points: int = 101) -> None:
+def write_curve_table(path: str | os.PathLike[str], fit: PodFit, *, size_name: str = "size") -> None:
     """Write `curve_rows` as comma-separated values, whole or not at all; the first column bears `size_name`."""
-    rows = curve_rows(fit, points=points)
+    rows = curve_rows(fit)
     with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         writer.writerow([size_name, "pod", "pod_low_95", "pod_high_95"])

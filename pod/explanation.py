@@ -21,6 +21,8 @@ from .repeats import fit_pod
 from .solver import fit_batch
 from .trials import Trials
 
+_FOLDS = 10  # parts of the images that are held out in turn
+
 Array = NDArray[np.float64]
 
 
@@ -53,7 +55,6 @@ def explain_detection(
     rng: np.random.Generator,
     link: str = "cloglog",
     repeats: str = "pooled",
-    folds: int = 10,
 ) -> tuple[tuple[Property, ...], CovariateFit | None]:
     """Properties in order of what they explain, best first, and the joint fit on all of them (None if there is none).
 
@@ -63,7 +64,6 @@ def explain_detection(
         rng: draws the folds.
         link: the link's name.
         repeats: how each property's own curve treats repeats, see `fit_pod`.
-        folds: parts of the images that are held out in turn.
 
     Raises:
         InputError: fewer than two properties, or images.
@@ -78,7 +78,7 @@ def explain_detection(
     units = int(unit.max()) + 1
     if units < 4:
         raise InputError("image", received=f"{units} images", expected="four or more, to hold some out")
-    fold = (rng.permutation(units) % min(folds, units))[unit]
+    fold = (rng.permutation(units) % min(_FOLDS, units))[unit]
     constant = _held_out(np.ones((len(table.size), 1)), table, fold, shape)
     scores: dict[str, tuple[bool, Array]] = {}
     for name, values in columns.items():

@@ -48,11 +48,6 @@ class Alternative:
     floor: float | None = None
 
     @property
-    def from_0_to_1(self) -> bool:
-        """Whether it has neither ceiling nor floor."""
-        return self.ceiling is self.floor is None
-
-    @property
     def name(self) -> str:
         """The curve in words: scale, link, ceiling or floor."""
         ends = [
@@ -193,13 +188,13 @@ def _widened(fit: PodFit, joined: OverLinks, best: Alternative) -> PodFit:
     )
 
 
-def compare_models(table: Trials, *, log_sizes: tuple[bool, ...] | None = None) -> tuple[Alternative, ...]:
+def compare_models(table: Trials) -> tuple[Alternative, ...]:
     """All links on size and, where every size is above 0, on log size, and what they fit with a ceiling or floor; best AIC first.
 
     The trials are taken as independent: with repeats the differences of deviance are too large, their order stands.
     Source: Pregibon, Appl. Stat. 29 (1980) 15; Hosmer & Lemeshow, Commun. Stat. A 9 (1980) 1043.
     """
-    scales = log_sizes if log_sizes is not None else ((False, True) if np.all(table.size > 0) else (False,))
+    scales = (False, True) if np.all(table.size > 0) else (False,)
     found: list[Alternative] = []
     curves: list[tuple[Alternative, Curve]] = []
     for name, link in LINKS.items():

@@ -27,6 +27,7 @@ from .trials import Trials
 
 Array = NDArray[np.float64]
 
+_MOST_IMAGES, _MOST_NETWORKS = 100_000, 1_000_000  # where searches end
 _FINE = 60  # sizes of the pattern that stands for any number of images
 _EXACT = 1e-6  # of the spread of a look at each of these: images without end and no spread of networks
 FEW_TRIALS = 40  # informative ones; below, expect longer intervals than planned
@@ -158,14 +159,13 @@ class Plan:
     fewest_networks: int
 
 
-def plan_pod(curve: AssumedCurve, *, wanted_over_a90: float, networks: int = 1, most_images: int = 100_000) -> Plan:
+def plan_pod(curve: AssumedCurve, *, wanted_over_a90: float, networks: int = 1) -> Plan:
     """Number of images for an expected one-sided 95 % bound of `wanted_over_a90` times a90.
 
     Args:
         curve: what is assumed.
         wanted_over_a90: bound over a90, above 1 (1.2: a90_95 some 20 % above a90).
         networks: number of networks, each looking at all images.
-        most_images: where the search ends.
 
     Raises:
         InputError: a wanted bound that is not above 1.
@@ -188,9 +188,9 @@ def plan_pod(curve: AssumedCurve, *, wanted_over_a90: float, networks: int = 1, 
         return math.inf if found is None else found
 
     limit = bound(math.inf, networks)
-    fewest = _smallest(lambda n: bound(math.inf, n) <= wanted_over_a90, 1_000_000) or 1_000_000
+    fewest = _smallest(lambda n: bound(math.inf, n) <= wanted_over_a90, _MOST_NETWORKS) or _MOST_NETWORKS
     images = (
-        _smallest(lambda n: bound(n, networks) <= wanted_over_a90, most_images) if limit < wanted_over_a90 else None
+        _smallest(lambda n: bound(n, networks) <= wanted_over_a90, _MOST_IMAGES) if limit < wanted_over_a90 else None
     )
     images = None if images is None else max(images, 4)
     chosen = recommended_sizes(curve, min(images, 2000), networks=networks) if images is not None else np.zeros(0)

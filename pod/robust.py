@@ -42,26 +42,22 @@ def bread(table: Trials, curve: Curve, *, log_size: bool) -> Array:
     return np.asarray(np.linalg.inv((design * weight[:, None]).T @ design))
 
 
-def clustered_meat(
-    left: Array, right: Array, groups: list[NDArray[np.intp]], groups_right: list[NDArray[np.intp]] | None = None
-) -> Array:
+def clustered_meat(left: Array, right: Array, groups: list[NDArray[np.intp]]) -> Array:
     """Sum over clusters of (sum of left scores) (sum of right scores)', multi-way by inclusion and exclusion; (2, 2).
 
     Args:
         left, right: (row, 2), score contributions (the same array for a variance).
-        groups: one array of codes (row,) a way of clustering, of the left rows.
-        groups_right: the same for the right rows, on shared codes; None = `groups`.
+        groups: one array of codes (row,) a way of clustering.
     """
-    other = groups if groups_right is None else groups_right
     meat = np.zeros((left.shape[1], right.shape[1]))
     for ways in range(1, len(groups) + 1):
         for chosen in combinations(range(len(groups)), ways):
-            code_left, code_right = _joined([groups[w] for w in chosen], [other[w] for w in chosen])
-            count = int(max(code_left.max(), code_right.max())) + 1
+            code = _joined([groups[way] for way in chosen])
+            count = int(code.max()) + 1
             total_left = np.zeros((count, left.shape[1]))
             total_right = np.zeros((count, right.shape[1]))
-            np.add.at(total_left, code_left, left)
-            np.add.at(total_right, code_right, right)
+            np.add.at(total_left, code, left)
+            np.add.at(total_right, code, right)
             factor = count / (count - 1) if ways == 1 and count > 1 else 1.0
             meat += (-1) ** (ways + 1) * factor * total_left.T @ total_right
     return meat
@@ -174,7 +170,7 @@ def clustered_fit(scores: Array, information: Array, groups: list[NDArray[np.int
     width = scores.shape[1]
     cells = np.zeros((width, width))
     if len(groups) > 1:
-        codes = _joined(groups, groups)[0]
+        codes = _joined(groups)
         totals = np.zeros((int(codes.max()) + 1, width))
         np.add.at(totals, codes, scores)
         inner = np.linalg.inv(information.sum(axis=0))
@@ -206,16 +202,14 @@ def clustered_total(rows: Array, groups: list[NDArray[np.intp]]) -> tuple[float,
     ways = [(float((one**2).sum()) * len(one) / max(len(one) - 1, 1), float(max(len(one) - 1, 1))) for one in sums]
     if len(ways) == 1:
         return ways[0]
-    cells = float((np.bincount(_joined(groups, groups)[0], weights=rows) ** 2).sum())
+    cells = float((np.bincount(_joined(groups), weights=rows) ** 2).sum())
     total = max(sum(value for value, _ in ways) - cells, *(value for value, _ in ways))
     return total, float(satterthwaite(total, ways))
 
 
-def _joined(left: list[NDArray[np.intp]], right: list[NDArray[np.intp]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    code_left, code_right = left[0], right[0]
-    for next_left, next_right in zip(left[1:], right[1:], strict=True):
-        base = int(max(next_left.max(), next_right.max())) + 1
-        both = np.concatenate((code_left * base + next_left, code_right * base + next_right))
-        codes = np.unique(both, return_inverse=True)[1]
-        code_left, code_right = codes[: len(code_left)], codes[len(code_left) :]
-    return code_left, code_right
+def _joined(groups: list[NDArray[np.intp]]) -> NDArray[np.intp]:
+    """One code (row,) for each combination of codes that occurs."""
+    code = groups[0]
+    for other in groups[1:]:
+        code = np.unique(code * (int(other.max()) + 1) + other, return_inverse=True)[1]
+    return code

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .links import Link
 
 Array = NDArray[np.float64]
+_MOST_STEPS = 100  # of one fit
 _CHUNK = 32_768  # elements of (fit, row) worked on at once: they stay in the processor's cache
 
 
@@ -36,7 +37,6 @@ def fit_batch(
     link: Link,
     bias_reduced: bool = False,
     start: Array | None = None,
-    iterations: int = 100,
 ) -> BatchFit:
     """Fit many hit/miss regressions on one design; coefficients per unit of the design's columns.
 
@@ -50,7 +50,6 @@ def fit_batch(
         link: the link function.
         bias_reduced: Firth's mean-bias reduction instead of maximum likelihood.
         start: coefficients to start from, (coefficient,) or (fit, coefficient).
-        iterations: the most steps of one fit.
 
     Returns:
         The fits. Separated data have no maximum: such fits hold NaN under maximum likelihood.
@@ -82,7 +81,7 @@ def fit_batch(
     solve = _adjusted if bias_reduced else _newton
     for first in range(0, fits, step):
         part = slice(first, first + step)
-        result = solve(columns, hits[part], misses[part], link, begin[part].copy(), iterations)
+        result = solve(columns, hits[part], misses[part], link, begin[part].copy())
         coefficients[part], information[part], log_likelihood[part], converged[part] = result
     # back to the units of the caller's columns: eta = sum_j b_j (x_j - centre_j) / scale_j
     back = np.diag(1.0 / scale)
@@ -127,7 +126,7 @@ def _products(columns: Array) -> tuple[Array, NDArray[np.intp]]:
 
 
 def _newton(
-    columns: Array, hits: Array, misses: Array, link: Link, begin: Array, iterations: int
+    columns: Array, hits: Array, misses: Array, link: Link, begin: Array
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     fits, width = begin.shape
     products, places = _products(columns)
@@ -139,7 +138,7 @@ def _newton(
     shared = bool(np.all(begin == begin[:1]))
     current, step = begin, np.zeros_like(begin)
     best = np.full(fits, -np.inf)
-    for _ in range(iterations):
+    for _ in range(_MOST_STEPS):
         if shared:
             # all fits still stand at one point: one row of eta serves them all, and the sums are plain products
             parts = link.log_parts(current[:1] @ columns.T)
@@ -187,7 +186,7 @@ def _newton(
 
 
 def _adjusted(
-    columns: Array, hits: Array, misses: Array, link: Link, begin: Array, iterations: int
+    columns: Array, hits: Array, misses: Array, link: Link, begin: Array
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     fits, width = begin.shape
     current = begin.copy()
@@ -195,7 +194,7 @@ def _adjusted(
     value = np.full(fits, np.nan)
     converged = np.zeros(fits, bool)
     running = np.arange(fits)
-    for _ in range(iterations):
+    for _ in range(_MOST_STEPS):
         step, size, matrix, log_likelihood = _scoring_step(
             columns, hits[running], misses[running], link, current[running]
         )

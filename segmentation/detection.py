@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 MARK_THRESHOLD = 0.5
 DETECTION_RECALL = 0.1
+_CONFIDENCE = 0.95  # of intervals
 _BY_CHANCE = 0.05  # level at which networks are said to differ, as in `pod`
 
 
@@ -132,9 +133,7 @@ def _known(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def rate_of_crossed_trials(
-    successes: NDArray[Any], *, networks: NDArray[Any], images: NDArray[Any], confidence: float = 0.95
-) -> Rate:
+def rate_of_crossed_trials(successes: NDArray[Any], *, networks: NDArray[Any], images: NDArray[Any]) -> Rate:
     """Share of successes of every network on every image, with an interval that knows that these are not independent.
 
     The variance of the mean is that of crossed random effects, S_image^2 / M + S_network^2 / N - S_rest^2 / (N M), with
@@ -148,7 +147,6 @@ def rate_of_crossed_trials(
     Args:
         successes: (trial,) 0 or 1 (or shares, such as recalls), each network on each image once.
         networks, images: (trial,) identifiers.
-        confidence: of the two-sided interval.
 
     Returns:
         The share with its interval; None without trials. `n` counts trials.
@@ -183,7 +181,7 @@ def rate_of_crossed_trials(
         freedom = max(variance**2 / parts, 1.0) if parts > 0 else np.inf
         few = (float(stdtrit(values.size - 1, 0.975)) / float(stdtrit(min(freedom, values.size - 1), 0.975))) ** 2
         effective = few * share * (1.0 - share) / variance
-    tail = (1.0 - confidence) / 2.0
+    tail = (1.0 - _CONFIDENCE) / 2.0
     count = share * effective
     low = float(betaincinv(count, effective - count + 1.0, tail)) if count > 0 else 0.0
     high = float(betaincinv(count + 1.0, effective - count, 1.0 - tail)) if share < 1 else 1.0

@@ -50,8 +50,8 @@ class Examples:
 class FreshExamples(Examples):
     """Examples that are made anew for every epoch; without an epoch they are those of epoch 0, which are kept."""
 
-    def __init__(self, load: Callable[[int, int], Example], count: int, *, cache_bytes: int = CACHE_BYTES) -> None:
-        super().__init__(lambda number: load(number, 0), count, cache_bytes=cache_bytes)
+    def __init__(self, load: Callable[[int, int], Example], count: int) -> None:
+        super().__init__(lambda number: load(number, 0), count)
         self._load_at = load
 
     def at_epoch(self, epoch: int) -> Examples:
@@ -103,7 +103,6 @@ def examples_from_dataset(
     numbers: Sequence[int] | NDArray[np.intp],
     *,
     recipe: Recipe,
-    cache_bytes: int = CACHE_BYTES,
     fresh: Callable[[int, int], NDArray[Any]] | None = None,
 ) -> Examples:
     """Examples of the pairs of a dataset file, by their numbers; the file must stay open.
@@ -122,8 +121,8 @@ def examples_from_dataset(
         return _example(image, dataset.foreign_object_masks(number), product, recipe)
 
     if fresh is not None:
-        return FreshExamples(load, len(wanted), cache_bytes=cache_bytes)
-    return Examples(load, len(wanted), cache_bytes=cache_bytes)
+        return FreshExamples(load, len(wanted))
+    return Examples(load, len(wanted))
 
 
 def _example(

@@ -125,13 +125,13 @@ def test_a_selection_and_a_concatenation_are_datasets_again(tmp_path):
     write(tmp_path / "b.h5", n=2, seed=1)
     with read_dataset(tmp_path / "a.h5") as a, read_dataset(tmp_path / "b.h5") as b:
         write_selected(a, tmp_path / "c.h5", selection=[3, 0], split="val")
-        concatenate_datasets([a, b], tmp_path / "d.h5", provenance={"joined": 2})
+        concatenate_datasets([a, b], tmp_path / "d.h5")
         with read_dataset(tmp_path / "c.h5") as c:
             assert [row.image for row in c.rows] == ["i3", "i0"] and {row.split for row in c.rows} == {"val"}
             assert c.has_counts and c.attributes["seed"] == 0
             np.testing.assert_array_equal(c.images(0), a.images(3))
         with read_dataset(tmp_path / "d.h5") as d:
-            assert len(d) == 7 and not d.has_counts and d.attributes["joined"] == 2
+            assert len(d) == 7 and not d.has_counts
             np.testing.assert_array_equal(d.images(6), b.images(1))
             assert d.rows[6].size_mm == 2.5
 

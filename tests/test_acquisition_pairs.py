@@ -100,8 +100,6 @@ def test_signals_below_the_minimum_are_set_to_it_so_that_nothing_is_infinite():
         flat_corrected_log(counts, dark_DN=100.0, flat_DN=flat), np.log([[1000.0, 1000.0, 1000.0, 500.0]]), rtol=1e-6
     )
     assert np.isfinite(flat_corrected_log(counts, dark_DN=100.0, flat_DN=np.zeros((1, 4)))).all()
-    with pytest.raises(InputError, match="minimum_DN: got 0"):
-        flat_corrected_log(counts, dark_DN=0.0, flat_DN=flat, minimum_DN=0)
 
 
 def test_bad_pixels_become_the_median_of_good_neighbours():
@@ -217,17 +215,12 @@ def test_contrasts_of_noisy_pairs_come_from_the_longest_exposure_of_the_same_sce
     with open_acquisition(tmp_path / "a.h5") as acquisition:
         dataset_from_acquisition(acquisition, tmp_path / "d.h5", low=short[0], high=short[1])
         dataset_from_acquisition(acquisition, tmp_path / "l.h5", low=long[0], high=long[1])
-        dataset_from_acquisition(
-            acquisition, tmp_path / "s.h5", low=short[0], high=short[1], contrast_from=(short[0], short[1])
-        )
-    d, long_ones, s = (read_dataset(tmp_path / name) for name in ("d.h5", "l.h5", "s.h5"))
-    with d, long_ones, s:
+    with read_dataset(tmp_path / "d.h5") as d, read_dataset(tmp_path / "l.h5") as long_ones:
         assert d.rows[1].contrast == long_ones.rows[1].contrast
         expected = delta_r(*long_ones.images(1), long_ones.foreign_object_masks(1))
         assert d.rows[1].contrast == pytest.approx(expected, rel=1e-5)
-        assert s.rows[1].contrast == pytest.approx(delta_r(*s.images(1), s.foreign_object_masks(1)), rel=1e-5)
-        assert abs(s.rows[1].contrast - d.rows[1].contrast) > 1e-3
-        assert d.rows[1].setting == s.rows[1].setting != long_ones.rows[1].setting
+        assert abs(d.rows[1].contrast - delta_r(*d.images(1), d.foreign_object_masks(1))) > 1e-3
+        assert d.rows[1].setting != long_ones.rows[1].setting
 
 
 def test_each_frame_can_make_an_image_of_its_own(tmp_path):
@@ -256,10 +249,6 @@ def test_a_setting_is_chosen_without_naming_its_filter_where_only_one_fits(tmp_p
             dataset_from_acquisition(acquisition, tmp_path / "e.h5")
         with pytest.raises(InputError, match="setting pair: got 0 that fit"):
             dataset_from_acquisition(acquisition, tmp_path / "e.h5", low=HIGH)
-        with pytest.raises(InputError, match="contrast of scene p0: got no pair at"):
-            dataset_from_acquisition(
-                acquisition, tmp_path / "e.h5", low=wanted[0], high=wanted[1], contrast_from=(LOW, HIGH)
-            )
     assert not (tmp_path / "e.h5").exists()
 
 

@@ -589,12 +589,11 @@ def test_every_plot_draws_what_it_is_given(fitted, tmp_path):
 def test_curve_table_holds_the_curve_and_its_band(fitted, tmp_path):
     fit, _ = fitted
     path = tmp_path / "curve.csv"
-    write_curve_table(path, fit, size_name="contrast", points=21)
+    write_curve_table(path, fit, size_name="contrast")
     with path.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert list(rows[0]) == ["contrast", "pod", "pod_low_95", "pod_high_95"]
-    assert len(rows) == 21
-    expected = curve_rows(fit, points=21)
+    expected = curve_rows(fit)
     assert [float(row["pod"]) for row in rows] == pytest.approx(expected["pod"], rel=1e-8)
     with pytest.raises(FitError, match="no curve to draw"):
         write_curve_table(tmp_path / "none.csv", fit_pod([0.1, 0.2], [1, 1]))

@@ -155,7 +155,7 @@ class CopyScan:
         return found if chance < math.log(FALSE_ALARM) else {}
 
 
-def same_scene(pieces: Iterable[NDArray[Any]], *, offset_DN: float = 0.0, lit: bool = True) -> SceneCheck:
+def same_scene(pieces: Iterable[NDArray[Any]], *, offset_DN: float = 0.0) -> SceneCheck:
     """Whether all frames show one scene, so that they differ by noise, drift and flicker alone.
 
     Each frame is reduced to means of blocks. From the difference of two frames a common factor, a smooth change of shape
@@ -170,7 +170,6 @@ def same_scene(pieces: Iterable[NDArray[Any]], *, offset_DN: float = 0.0, lit: b
     Args:
         pieces: frames in time order, arrays (m, row, column), DN; read once.
         offset_DN: level without light, so that changes are relative to the signal.
-        lit: False for darks, whose level and shape have no scale: only structure and lines are judged.
 
     Returns:
         The answer; `same` is None for a single frame and for fields of fewer than 16 pixels a side.
@@ -178,7 +177,7 @@ def same_scene(pieces: Iterable[NDArray[Any]], *, offset_DN: float = 0.0, lit: b
     scan = SceneScan()
     for piece in pieces:
         scan.add(piece)
-    return scan.result(offset_DN=offset_DN, lit=lit)
+    return scan.result(offset_DN=offset_DN)
 
 
 def with_median_at(frames: NDArray[Any], pixels: NDArray[np.bool_]) -> NDArray[Any]:
@@ -220,7 +219,10 @@ class SceneScan:
                 self._kept, self._indices, self._stride = self._kept[::2], self._indices[::2], 2 * self._stride
 
     def result(self, *, offset_DN: float = 0.0, lit: bool = True) -> SceneCheck:
-        """The answer for the frames taken so far; see `same_scene`."""
+        """The answer for the frames taken so far; see `same_scene`.
+
+        lit: False for darks, whose level and shape have no scale: only structure and lines are judged.
+        """
         if len(self._kept) < 2:
             return _cannot_tell(self._side, (0, 0))
         sigma_DN = 1.4826 * float(np.median(self._spreads)) / math.sqrt(2.0)

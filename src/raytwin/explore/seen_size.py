@@ -67,9 +67,6 @@ def read_networks_observer(
     path: str,
     references: str,
     twin: Twin,
-    *,
-    product_material: str | None = None,
-    foreign_material: str | None = None,
 ) -> NetworksObserver:
     """A calibrated observer with the objects of a dataset, of the materials with which it was calibrated.
 
@@ -77,7 +74,7 @@ def read_networks_observer(
         InputError, FileFormatError: no such files, other kinds of files.
     """
     efficiency = read_efficiency(path)
-    product, foreign = materials_seen(efficiency, product_material, foreign_material)
+    product, foreign = materials_seen(efficiency, None, None)
     with read_dataset(references) as dataset:
         sight = sight_of_references(
             LineImages(twin),

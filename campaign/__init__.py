@@ -13,7 +13,8 @@ Files:
     trial              networks trained on one file and tried on another
     ensemble           networks of one recipe in several processes
     table              the paper's table; table_effects: lines with an effect beside it; table_page: its page
-    task               POD before and after a diagnosis; object_material: what its objects are made of; task_page: on the page
+    task               POD before and after a diagnosis; task_plan: how large, and of what; task_images: its images;
+                       object_material: what its objects are made of; task_page: on the page
     starter            images of the starter network
     chain              commands in order, answers kept
     lab_line           the paper's experiment on the virtual lab: line and images

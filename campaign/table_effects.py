@@ -19,7 +19,8 @@ from ..generator.twins.twin_io import read_twin
 from ..lab.effects import request_from_text
 from ._plain import plain
 from .chain import Chain, claim_folder
-from .task import TaskInput, TaskPlan, run_task
+from .task import run_task
+from .task_plan import TaskInput, TaskPlan
 
 SESSION, PRODUCTS, DIAGNOSIS = "session.h5", "products.h5", "diagnosis"
 USUAL_EFFECTS = ("object_scatter=20", "motion_blur=4", "veiling_glare=3")  # clear ones, within plausible ranges

@@ -9,10 +9,12 @@ import pytest
 
 from raytwin.acquisition import open_acquisition, read_dataset
 from raytwin.acquisition.pairs import PairCorrector, object_pairs
-from raytwin.campaign import object_material
+from raytwin.campaign import object_material, task_images
 from raytwin.campaign import task as task_module
-from raytwin.campaign.task import TaskInput, TaskPlan, check_task, run_task, scene_of
+from raytwin.campaign.task import check_task, run_task
 from raytwin.campaign.task_page import pod_charts, task_text
+from raytwin.campaign.task_plan import TaskInput, TaskPlan
+from raytwin.campaign.trial import scene_of
 from raytwin.cli import main
 from raytwin.errors import InputError
 from raytwin.generator.datasets.known_scenes import KnownScenes
@@ -179,7 +181,7 @@ def stand_in(monkeypatch):
     monkeypatch.setattr(task_module, "detect_on_file", detect)
     monkeypatch.setattr(task_module, "thresholds_from_images", lambda *words, **options: {0: 0.5, 1: 0.5})
     monkeypatch.setattr(task_module, "_FEWEST_TO_LEARN", 3)
-    monkeypatch.setattr(task_module, "_START_AVERAGED", 1)
+    monkeypatch.setattr(task_images, "_START_AVERAGED", 1)
     return limits, trained
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pandas
 
     from ..acquisition.acquisition_io import AcquisitionFile
-    from ..campaign.task import TaskInput, TaskPlan
+    from ..campaign.task_plan import TaskInput, TaskPlan
     from ..checks.check_result import CheckResult
     from ..diagnosis.advice.plan_session import SessionPlan
     from ..diagnosis.judgement.answer import Diagnosis
@@ -215,7 +215,7 @@ def diagnose(
         plan_only: say which effects these series could distinguish, whatever the frames show.
         output: folder for diagnosis.json, report.html and twin.h5; None: nothing is written.
         task: POD before and after, which needs `output`: `measured` (images of the line as it is), `products`, `low`, `high`, and
-            fields of `raytwin.campaign.task.TaskPlan` (networks, steps, images, ...).
+            fields of `raytwin.campaign.task_plan.TaskPlan` (networks, steps, images, ...).
         device: of the task's networks.
         seed: a whole number or a generator.
         progress: True for a line that changes, or a function of (stage, done, total).
@@ -294,7 +294,8 @@ def _write(found: "Diagnosis", folder: Path) -> None:
 
 def _task(task: Mapping[str, Any], *, seed: int, device: str) -> "tuple[TaskInput, TaskPlan]":
     """What a task asks for, checked before the diagnosis begins."""
-    from ..campaign.task import TaskInput, TaskPlan, check_task
+    from ..campaign.task import check_task
+    from ..campaign.task_plan import TaskInput, TaskPlan
     from ..generator.predictions.predict_settings import as_setting
     from ..segmentation import choose_device
 

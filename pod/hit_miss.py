@@ -263,74 +263,99 @@ def sizes_from_curve(
         at[percent], note = size_in_range(x, smallest=smallest, largest=largest, log_size=log_size, percent=percent)
         if note:
             notes.append(note)
-    reaches_90 = (curve.link.eta_from_pod(0.9) - c0) / c1 <= largest
-    one = two = low = NO_BOUNDS
-    freedom = math.inf
+    bounds, freedom = _Bounds90(one_sided=NO_BOUNDS, two_sided=NO_BOUNDS, low=NO_BOUNDS), None
     if at[90] is not None:
         x90 = math.log(at[90]) if log_size else at[90]
-        toward = np.array([1.0, x90])
-        error = math.sqrt(max(float(toward @ curve.covariance @ toward), 0.0)) / c1
-        judged = curve
-        if clustered is not None:
-            spread, freedom_at = clustered.variance(toward)
-            freedom = float(freedom_at)
-            judged = effective_trials(curve, float(spread) / float(toward @ curve.covariance @ toward))
-        eta = curve.link.eta_from_pod(0.9)
-        inside = x90 if separated else curve.most_likely_x(eta)
-        bounds = {}
-        for key, below, upper in (("one", ONE_SIDED, True), ("two", TWO_SIDED, True), ("low", TWO_SIDED, False)):
-            z = float(student_quantile(below, freedom))
-            wald: float | None = x90 + z * error if upper else x90 - z * error
-            if separated:
-                if not upper or may_be_flat(judged, eta=eta, quantile=z * z, upper=upper):
-                    wald = None
-                bounds[key] = Bounds(wald=size_from_x(wald, log_size=log_size))
-                continue
-            ratio = size_bound(judged, eta=eta, quantile=z * z, upper=upper, start=inside)
-            if clustered is not None:
-                wald = size_from_test(
-                    lambda at: _excess(curve, clustered, eta=eta, x=at),
-                    below=below,
-                    upper=upper,
-                    start=x90,
-                    span=largest - smallest,
-                )
-            modified = None
-            if curve.at_maximum:
-                modified = modified_bound(judged, eta=eta, z=z, upper=upper, start=ratio)
-            if clustered is not None:
-                wald = not_short_of_likelihood(wald, ratio if modified is None else modified, upper=upper)
-            bounds[key] = Bounds(
-                likelihood_ratio=size_from_x(ratio, log_size=log_size),
-                wald=size_from_x(wald, log_size=log_size),
-                modified=size_from_x(modified, log_size=log_size),
-            )
-        one, two, low = bounds["one"], bounds["two"], bounds["low"]
-        if trusted_bound(two, separated=separated) is None:
-            which = "one-sided or two-sided" if trusted_bound(one, separated=separated) is None else "two-sided"
-            notes.append(
-                f"a flat curve is within the {which} 95 % likelihood region: the data give no upper likelihood-ratio"
-                " bound on a90 (more trials, or sizes over a wider range, would)"
-            )
-        if not separated and trusted_bound(low, separated=separated) is None:
-            notes.append(
-                "a flat curve above 90 % is within the two-sided 95 % likelihood region: the data give no lower likelihood-ratio"
-                " bound on a90 (more small sizes would)"
-            )
-        largest_size = float(table.size.max())
-        given = [value for value in (one.likelihood_ratio, one.wald, one.modified) if value is not None]
-        if given and max(given) > largest_size:
-            notes.append(f"a 95 % bound on a90 lies beyond the largest size tested ({largest_size:g}): extrapolated")
+        bounds, freedom = _bounds_on_a90(curve, x90=x90, log_size=log_size, clustered=clustered, separated=separated)
+        notes += _notes_on_bounds(bounds, separated=separated, largest_size=float(table.size.max()))
     return Sizes(
         a50=at[50],
         a90=at[90],
-        one_sided=one,
-        two_sided=two,
-        low=low,
-        reaches_90=bool(reaches_90),
+        one_sided=bounds.one_sided,
+        two_sided=bounds.two_sided,
+        low=bounds.low,
+        reaches_90=bool((curve.link.eta_from_pod(0.9) - c0) / c1 <= largest),
         warnings=tuple(notes),
-        degrees_of_freedom=freedom if at[90] is not None and clustered is not None else None,
+        degrees_of_freedom=None if clustered is None else freedom,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Bounds90:
+    """One-sided upper, two-sided upper and two-sided lower 95 % bounds on a90, in the data's unit."""
+
+    one_sided: Bounds
+    two_sided: Bounds
+    low: Bounds
+
+
+def _bounds_on_a90(
+    curve: Curve, *, x90: float, log_size: bool, clustered: Clustered | None, separated: bool
+) -> tuple[_Bounds90, float]:
+    """Bounds on a90 = size at `x90`, and their degrees of freedom; other arguments as of `sizes_from_curve`."""
+    toward = np.array([1.0, x90])
+    variance = float(toward @ curve.covariance @ toward)
+    error = math.sqrt(max(variance, 0.0)) / curve.coefficients[1]
+    judged, freedom = curve, math.inf
+    if clustered is not None:
+        variance_of_clusters, degrees = clustered.variance(toward)
+        freedom = float(degrees)
+        judged = effective_trials(curve, float(variance_of_clusters) / variance)
+    eta = curve.link.eta_from_pod(0.9)
+    inside = x90 if separated else curve.most_likely_x(eta)
+
+    def bound(below: float, *, upper: bool) -> Bounds:
+        z = float(student_quantile(below, freedom))
+        wald: float | None = x90 + z * error if upper else x90 - z * error
+        if separated:
+            if not upper or may_be_flat(judged, eta=eta, quantile=z * z, upper=upper):
+                wald = None
+            return Bounds(wald=size_from_x(wald, log_size=log_size))
+        ratio = size_bound(judged, eta=eta, quantile=z * z, upper=upper, start=inside)
+        modified = modified_bound(judged, eta=eta, z=z, upper=upper, start=ratio) if curve.at_maximum else None
+        if clustered is not None:
+            by_test = size_from_test(
+                lambda at: _excess(curve, clustered, eta=eta, x=at),
+                below=below,
+                upper=upper,
+                start=x90,
+                span=float(curve.x[-1]) - float(curve.x[0]),
+            )
+            wald = not_short_of_likelihood(by_test, ratio if modified is None else modified, upper=upper)
+        return Bounds(
+            likelihood_ratio=size_from_x(ratio, log_size=log_size),
+            wald=size_from_x(wald, log_size=log_size),
+            modified=size_from_x(modified, log_size=log_size),
+        )
+
+    found = _Bounds90(
+        one_sided=bound(ONE_SIDED, upper=True),
+        two_sided=bound(TWO_SIDED, upper=True),
+        low=bound(TWO_SIDED, upper=False),
+    )
+    return found, freedom
+
+
+def _notes_on_bounds(bounds: _Bounds90, *, separated: bool, largest_size: float) -> list[str]:
+    """Why a bound on a90 is not given, and that one is extrapolated."""
+    notes = []
+    if trusted_bound(bounds.two_sided, separated=separated) is None:
+        neither = trusted_bound(bounds.one_sided, separated=separated) is None
+        which = "one-sided or two-sided" if neither else "two-sided"
+        notes.append(
+            f"a flat curve is within the {which} 95 % likelihood region: the data give no upper likelihood-ratio"
+            " bound on a90 (more trials, or sizes over a wider range, would)"
+        )
+    if not separated and trusted_bound(bounds.low, separated=separated) is None:
+        notes.append(
+            "a flat curve above 90 % is within the two-sided 95 % likelihood region: the data give no lower likelihood-ratio"
+            " bound on a90 (more small sizes would)"
+        )
+    one = bounds.one_sided
+    given = [value for value in (one.likelihood_ratio, one.wald, one.modified) if value is not None]
+    if given and max(given) > largest_size:
+        notes.append(f"a 95 % bound on a90 lies beyond the largest size tested ({largest_size:g}): extrapolated")
+    return notes
 
 
 def effective_trials(curve: Curve, design_effect: float) -> Curve:

@@ -25,6 +25,7 @@ from .trials import Trials
 Array = NDArray[np.float64]
 
 _TINY = 1e-9
+_FLOOR, _CEILING = 2, 3  # places among c0, c1, floor, ceiling
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,23 +87,11 @@ def fit_lapse_pod(
     best, value = problem.minimise(None, starts=problem.starts(plain))
     c0, slope, low_share, high_share = problem.parameters(best)
     notes: list[str] = []
-
-    def interval(index: int, estimate: float) -> Share:
-        ends = []
-        for side in (-1.0, 1.0):
-            limit = (0.5 if index == 3 else 0.0) if side < 0 else (1.0 if index == 3 else 0.5)
-            if abs(estimate - limit) < 1e-7:
-                ends.append(limit)
-                continue
-
-            def drop(at: float, index: int = index) -> float:
-                return problem.minimise({index: at}, starts=[best])[1] - value
-
-            ends.append(_root(drop, estimate, limit, Z_TWO_SIDED**2))
-        return Share(value=estimate, low=ends[0], high=ends[1])
-
-    top = interval(3, high_share) if ceiling else Share(value=1.0, low=1.0, high=1.0)
-    bottom = interval(2, low_share) if floor else Share(value=0.0, low=0.0, high=0.0)
+    top, bottom = Share(value=1.0, low=1.0, high=1.0), Share(value=0.0, low=0.0, high=0.0)
+    if ceiling:
+        top = problem.interval(_CEILING, best, value, within=(0.5, 1.0))
+    if floor:
+        bottom = problem.interval(_FLOOR, best, value, within=(0.0, 0.5))
     if ceiling and top.low <= 0.5 + 1e-6:
         notes.append("the trials of large objects are too few to bound the ceiling from below")
     a50 = a90 = bound = bound_two = bound_low = None
@@ -124,27 +113,14 @@ def fit_lapse_pod(
             if note:
                 notes.append(note)
         a50, a90 = sizes[50], sizes[90]
-        if a90 is not None:
-            at90 = math.log(a90) if log_size else a90
-            span = float(problem.x[-1] - problem.x[0])
-            # a curve that never reaches 90 % is one with its a90 at infinity
-            never = problem.minimise({3: 0.9}, starts=[best])[1] - value if ceiling else math.inf
-
-            def drop90(at: float) -> float:
-                return problem.minimise_through(at, 0.9, starts=[best]) - value
-
-            ends = []
-            for quantile in (Z_ONE_SIDED**2, Z_TWO_SIDED**2):
-                far = at90 + 20 * span
-                held = never > quantile and drop90(far) > quantile
-                ends.append(_root(drop90, at90, far, quantile) if held else None)
-            ends.append(_root(drop90, at90, at90 - 20 * span, Z_TWO_SIDED**2))
-            bound, bound_two, bound_low = (size_from_x(end, log_size=log_size) for end in ends)
-            if bound is None or bound_two is None:
-                which, what = ("", "bound") if bound is None else ("two-sided ", "upper end of a two-sided interval")
-                notes.append(
-                    f"a curve that never reaches 90 % is within the {which}95 % likelihood region: no {what} on a90"
-                )
+    if a90 is not None:
+        ends = problem.bounds_on_a90(math.log(a90) if log_size else a90, best, value)
+        bound, bound_two, bound_low = (size_from_x(end, log_size=log_size) for end in ends)
+        if bound is None or bound_two is None:
+            which, what = ("", "bound") if bound is None else ("two-sided ", "upper end of a two-sided interval")
+            notes.append(
+                f"a curve that never reaches 90 % is within the {which}95 % likelihood region: no {what} on a90"
+            )
     gain = max(problem.deviance(np.array([*plain, 0.0, 1.0]))[0] - value, 0.0)
     return LapseFit(
         link=link,
@@ -297,6 +273,39 @@ class _Problem:
                 answer = minimize(held, begin, method="L-BFGS-B", bounds=limits, options={"ftol": 1e-13, "eps": 1e-7})
                 lowest = min(lowest, float(answer.fun))
         return lowest
+
+    def interval(self, place: int, best: Array, lowest: float, *, within: tuple[float, float]) -> Share:
+        """A floor or ceiling with its two-sided 95 % likelihood interval; lowest: the deviance of the best parameters."""
+        estimate = float(best[place])
+
+        def excess(at: float) -> float:
+            return self.minimise({place: at}, starts=[best])[1] - lowest
+
+        low, high = (
+            limit if abs(estimate - limit) < 1e-7 else _root(excess, estimate, limit, Z_TWO_SIDED**2)
+            for limit in within
+        )
+        return Share(value=estimate, low=low, high=high)
+
+    def bounds_on_a90(self, at90: float, best: Array, lowest: float) -> list[float | None]:
+        """One-sided upper, two-sided upper and two-sided lower 95 % bound on the x of a90, `at90` by the best parameters.
+
+        None where curves that never reach 90 % are within the likelihood region.
+        """
+        span = float(self.x[-1] - self.x[0])
+        far = at90 + 20 * span
+        # a curve that never reaches 90 % is one with its a90 at infinity
+        never = self.minimise({_CEILING: 0.9}, starts=[best])[1] - lowest if self.ceiling else math.inf
+
+        def excess(at: float) -> float:
+            return self.minimise_through(at, 0.9, starts=[best]) - lowest
+
+        ends: list[float | None] = []
+        for quantile in (Z_ONE_SIDED**2, Z_TWO_SIDED**2):
+            held = never > quantile and excess(far) > quantile
+            ends.append(_root(excess, at90, far, quantile) if held else None)
+        ends.append(_root(excess, at90, at90 - 20 * span, Z_TWO_SIDED**2))
+        return ends
 
     @staticmethod
     def parameters(p: Array) -> tuple[float, float, float, float]:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Filter, Setting, filters_from_text, text_from_filters
 from ..generator.line.measured_flats import measured_flats
-from ..generator.line.spectral_signal import OpenBeam
-from ..generator.line.twin import Z95, Estimate, Twin
+from ..generator.line.spectral_signal import OpenBeam, SpectralModel
+from ..generator.line.twin import Z95, Estimate, Level, SpectralPosterior, Twin
 from ..generator.predictions.predict import spectral_model_of
 from ..materials import material_from_name, transmission
 from ..spectra import MAXIMUM_KV_OF_ANODE, MINIMUM_KV
@@ -29,6 +29,8 @@ _REACH = 1.33  # design and candidates go so far above the highest measured kV
 _LONGEST = 10.0  # times the longest exposure measured
 _DIMMEST = 0.3  # of the dimmest flat's signal: less is not worth measuring
 _RIDGE = 1e-12
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,98 +149,169 @@ def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
         return ()
     voltages = sorted({float(level.kV or 0.0) for level in measured})
     every_kV = voltages_within_reach(voltages, posterior.anode)
-    model = spectral_model_of(twin, highest_kV=max(every_kV))
-    stacks = {filters_from_text(text) for text in posterior.calibrated_filters}
-    plates = sorted({*stacks, *(filters_from_text(text) for text in _PLATES)}, key=str)
-    design = sorted({*stacks, *(filters_from_text(text) for text in _DESIGN_PLATES)}, key=str)
-    signals: dict[OpenBeam, NDArray[np.float64]] = {}
+    logs = _Logarithms(spectral_model_of(twin, highest_kV=max(every_kV)), posterior.samples)
+    predicted = _predictions(logs, measured, every_kV, posterior)
+    candidates = _candidates(twin, logs, measured, every_kV, posterior)
 
-    def logs(kV: float, filters: tuple[Filter, ...]) -> NDArray[np.float64]:
-        """Logarithms of level, gain and air kerma (3, draw)."""
-        beam = OpenBeam(kV=kV, filters=filters)
-        if beam not in signals:
-            found = model.signal(posterior.samples, beam)
-            signals[beam] = np.log([found.rate_DN_per_mAs, found.gain_DN, found.kerma_uGy_per_mAs])
-        return signals[beam]
-
-    known = {(float(level.kV or 0.0), frozenset(map(str, level.filters))) for level in measured}
-    grid = [
-        (kV, filters)
-        for kV in every_kV
-        for filters in design
-        if (kV, frozenset(map(str, filters))) not in known and _passes(filters, kV)
-    ]
-    rows = []
-    for kV, filters in grid:
-        rate, gain, kerma = logs(kV, filters)
-        rows += [rate, 0.5 * (rate + gain), kerma]
-    wanted = np.array(rows)
-    wanted = wanted - wanted.mean(axis=1, keepdims=True)
-    draws = wanted.shape[1]
-    level_sd, gain_sd = posterior.level_discrepancy, posterior.gain_discrepancy
-    floor = np.tile([level_sd**2, 0.25 * (level_sd**2 + gain_sd**2), level_sd**2], len(grid))
-    of_kerma = np.arange(len(floor)) % 3 == 2
-    before = np.mean(wanted**2, axis=1)
-    rate_noise = _median_relative_sd([level.rate_DN_per_mAs for level in measured])
-    gain_noise = _median_relative_sd([level.photon_transfer_slope_DN for level in measured])
-    # kind, setting, steps, logarithms seen (datum, draw), their noise (datum, datum)
-    candidates: list[tuple[str, Setting, tuple[Filter, ...], NDArray[np.float64], NDArray[np.float64]]] = []
-    for kV in every_kV:
-        for filters in plates:
-            if (kV, frozenset(map(str, filters))) in known or not _passes(filters, kV):
-                continue
-            setting = _exposed(twin, kV, filters, float(np.exp(np.median(logs(kV, filters)[0]))))
-            if setting is not None:
-                noise = np.array([math.hypot(rate_noise, level_sd), math.hypot(gain_noise, gain_sd)]) ** 2
-                candidates.append(("flats", setting, (), logs(kV, filters)[:2], np.diag(noise)))
-    for kV in every_kV:
-        for filters in sorted(stacks, key=str):
-            setting = _exposed(twin, kV, filters, float(np.exp(np.median(logs(kV, filters)[0]))))
-            if _passes(filters, kV) and setting is not None:
-                candidates.append(("dose", setting, (), logs(kV, filters)[2:], np.array([[_DOSE_SD**2 + level_sd**2]])))
-    for level in measured:
-        kV, filters = float(level.kV or 0.0), level.filters
-        setting = _exposed(twin, kV, filters, float(np.exp(np.median(logs(kV, filters)[0]))))
-        if setting is None:
-            continue
-        steps = tuple(Filter(material="Al", thickness_mm=mm) for mm in _WEDGE_MM)
-        open_rate = logs(kV, filters)[0]
-        behind = np.array([logs(kV, (*filters, step))[0] - open_rate for step in steps])
-        of_thickness = WEDGE_THICKNESS.sd * behind.mean(axis=1)
-        noise = np.outer(of_thickness, of_thickness) + (_WEDGE_SD**2 + level_sd**2) * np.eye(len(steps))
-        candidates.append(("wedge", setting, steps, behind, noise))
+    now = predicted.half_width()
+    levels_percent = 100.0 * now[_LEVEL::3]
+    elsewhere = np.array([kV not in voltages for kV, _ in predicted.grid], dtype=bool)
+    other_kV = float(np.mean(levels_percent[elsewhere])) if elsewhere.any() else None
+    measured_kV = float(np.mean(levels_percent[~elsewhere])) if not elsewhere.all() else None
+    names = tuple(f"{kV:g} kV {text_from_filters(filters)}".strip() for kV, filters in predicted.grid)
+    of_kerma = np.arange(len(now)) % 3 == _KERMA
     ranked = []
-    half_width = Z95 * np.sqrt(before + floor)
-    width = 100.0 * float(np.mean(half_width[::3]))
-    elsewhere = np.array([kV not in voltages for kV, _ in grid], dtype=bool)
-    of_levels = 100.0 * half_width[::3]
-    other_kV = float(np.mean(of_levels[elsewhere])) if elsewhere.any() else None
-    measured_kV = float(np.mean(of_levels[~elsewhere])) if not elsewhere.all() else None
-    names = tuple(f"{kV:g} kV {text_from_filters(filters)}".strip() for kV, filters in grid)
-    for kind, setting, steps, seen, noise in candidates:
-        centred = seen - seen.mean(axis=1, keepdims=True)
-        cross = wanted @ centred.T / draws
-        own = centred @ centred.T / draws + noise + _RIDGE * np.eye(len(noise))
-        gained = np.sum(cross * np.linalg.solve(own, cross.T).T, axis=1)
-        after = Z95 * np.sqrt(np.maximum(before - gained, 0.0) + floor)
+    for candidate in candidates:
+        after = predicted.half_width(candidate)
         shrinks_to, dose_shrinks_to = (
-            float(np.mean(after[chosen]) / np.mean(half_width[chosen])) for chosen in (~of_kerma, of_kerma)
+            float(np.mean(after[chosen]) / np.mean(now[chosen])) for chosen in (~of_kerma, of_kerma)
         )
         ranked.append(
             NextMeasurement(
-                kind=kind,
-                text=_sentence(kind, setting, steps, shrinks_to, dose_shrinks_to),
-                setting=setting,
-                layers=steps,
+                kind=candidate.kind,
+                text=_sentence(candidate.kind, candidate.setting, candidate.steps, shrinks_to, dose_shrinks_to),
+                setting=candidate.setting,
+                layers=candidate.steps,
                 shrinks_to=shrinks_to,
                 dose_shrinks_to=dose_shrinks_to,
-                width_percent=width,
+                width_percent=100.0 * float(np.mean(now[_LEVEL::3])),
                 other_kV_percent=other_kV,
                 measured_kV_percent=measured_kV,
                 grid=names,
             )
         )
     return tuple(sorted(ranked, key=lambda item: item.shrinks_to))
+
+
+_Beam = tuple[float, tuple[Filter, ...]]  # kV and filters
+_LEVEL, _NOISE, _KERMA = range(3)  # numbers that are predicted at each beam of the grid
+
+
+class _Logarithms:
+    """Logarithms of level, gain and air kerma of a beam (3, draw), over the posterior's draws; each beam computed once."""
+
+    def __init__(self, model: SpectralModel, samples: Array) -> None:
+        self._model, self._samples = model, samples
+        self._known: dict[OpenBeam, Array] = {}
+
+    def __call__(self, kV: float, filters: tuple[Filter, ...]) -> Array:
+        beam = OpenBeam(kV=kV, filters=filters)
+        if beam not in self._known:
+            found = self._model.signal(self._samples, beam)
+            self._known[beam] = np.log([found.rate_DN_per_mAs, found.gain_DN, found.kerma_uGy_per_mAs])
+        return self._known[beam]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Candidate:
+    """What could be measured: its logarithms over the draws, seen (datum, draw), and their noise (datum, datum)."""
+
+    kind: str
+    setting: Setting
+    steps: tuple[Filter, ...] = ()
+    seen: Array
+    noise: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Predictions:
+    """Logarithms of level, noise and kerma at each beam of the grid in turn, less their means (3 beams, draw).
+
+    floor: (3 beams,) variance that stays whatever is measured.
+    """
+
+    grid: list[_Beam]
+    logs: Array
+    floor: Array
+
+    def half_width(self, candidate: _Candidate | None = None) -> Array:
+        """Half width of each number's 95 % interval, relative (3 beams,), now or once the candidate is measured."""
+        variance = np.mean(self.logs**2, axis=1)
+        if candidate is not None:
+            draws = self.logs.shape[1]
+            seen = candidate.seen - candidate.seen.mean(axis=1, keepdims=True)
+            cross = self.logs @ seen.T / draws
+            own = seen @ seen.T / draws + candidate.noise + _RIDGE * np.eye(len(candidate.noise))
+            gained = np.sum(cross * np.linalg.solve(own, cross.T).T, axis=1)
+            variance = np.maximum(variance - gained, 0.0)
+        return np.asarray(Z95 * np.sqrt(variance + self.floor))
+
+
+def _predictions(
+    logs: _Logarithms, measured: Sequence[Level], every_kV: Sequence[float], posterior: SpectralPosterior
+) -> _Predictions:
+    """What shall be known: beams that were not measured, of all voltages behind a few filters."""
+    known = _beams(measured)
+    grid = [
+        (kV, filters)
+        for kV in every_kV
+        for filters in _stacks(posterior, _DESIGN_PLATES)
+        if (kV, frozenset(map(str, filters))) not in known and _passes(filters, kV)
+    ]
+    rows = []
+    for kV, filters in grid:
+        rate, gain, kerma = logs(kV, filters)
+        rows += [rate, 0.5 * (rate + gain), kerma]
+    values = np.array(rows)
+    level_sd, gain_sd = posterior.level_discrepancy, posterior.gain_discrepancy
+    floor = np.tile([level_sd**2, 0.25 * (level_sd**2 + gain_sd**2), level_sd**2], len(grid))
+    return _Predictions(grid=grid, logs=values - values.mean(axis=1, keepdims=True), floor=floor)
+
+
+def _candidates(
+    twin: Twin,
+    logs: _Logarithms,
+    measured: Sequence[Level],
+    every_kV: Sequence[float],
+    posterior: SpectralPosterior,
+) -> list[_Candidate]:
+    """Flats of new beams, readings of dose behind the filters at hand, and wedges at the beams that were measured."""
+    known = _beams(measured)
+    level_sd, gain_sd = posterior.level_discrepancy, posterior.gain_discrepancy
+    rate_noise = _median_relative_sd([level.rate_DN_per_mAs for level in measured])
+    gain_noise = _median_relative_sd([level.photon_transfer_slope_DN for level in measured])
+
+    def exposed(kV: float, filters: tuple[Filter, ...]) -> Setting | None:
+        return _exposed(twin, kV, filters, float(np.exp(np.median(logs(kV, filters)[_LEVEL]))))
+
+    found = []
+    for kV in every_kV:
+        for filters in _stacks(posterior, _PLATES):
+            if (kV, frozenset(map(str, filters))) in known or not _passes(filters, kV):
+                continue
+            setting = exposed(kV, filters)
+            if setting is not None:
+                noise = np.array([math.hypot(rate_noise, level_sd), math.hypot(gain_noise, gain_sd)]) ** 2
+                found.append(
+                    _Candidate(kind="flats", setting=setting, seen=logs(kV, filters)[:2], noise=np.diag(noise))
+                )
+    for kV in every_kV:
+        for filters in _stacks(posterior):
+            setting = exposed(kV, filters)
+            if _passes(filters, kV) and setting is not None:
+                variance = np.array([[_DOSE_SD**2 + level_sd**2]])
+                found.append(_Candidate(kind="dose", setting=setting, seen=logs(kV, filters)[2:], noise=variance))
+    steps = tuple(Filter(material="Al", thickness_mm=mm) for mm in _WEDGE_MM)
+    for level in measured:
+        kV, filters = float(level.kV or 0.0), level.filters
+        setting = exposed(kV, filters)
+        if setting is None:
+            continue
+        behind = np.array([logs(kV, (*filters, step))[_LEVEL] - logs(kV, filters)[_LEVEL] for step in steps])
+        of_thickness = WEDGE_THICKNESS.sd * behind.mean(axis=1)
+        noise = np.outer(of_thickness, of_thickness) + (_WEDGE_SD**2 + level_sd**2) * np.eye(len(steps))
+        found.append(_Candidate(kind="wedge", setting=setting, steps=steps, seen=behind, noise=noise))
+    return found
+
+
+def _beams(measured: Sequence[Level]) -> set[tuple[float, frozenset[str]]]:
+    """kV and filters, in any order, of the measured levels."""
+    return {(float(level.kV or 0.0), frozenset(map(str, level.filters))) for level in measured}
+
+
+def _stacks(posterior: SpectralPosterior, plates: Sequence[str] = ()) -> list[tuple[Filter, ...]]:
+    """Filters that were calibrated, and plates that anyone has."""
+    return sorted({filters_from_text(text) for text in (*posterior.calibrated_filters, *plates)}, key=str)
 
 
 def voltages_within_reach(measured: Sequence[float], anode: str) -> tuple[float, ...]:

@@ -12,7 +12,11 @@ from .check_result import Allowed, SeriesRow
 from .findings import Finding, FindingCode
 
 DARK_LEVEL, READ_NOISE, LEVEL, NOISE, SPECTRUM = "dark level", "read noise", "level", "gain and blur", "spectrum"
-LAG, IMAGES, WEDGE, VALIDATION = "lag", "reference images", "attenuation", "validation"
+LAG, IMAGES, VALIDATION = "lag", "reference images", "validation"
+# what can be learnt from series that serve for it
+OF_DARKS, OF_READ_NOISE, OF_NOISE = "dark level", "read noise", "gain, blur and photons a pixel"
+OF_LOADS, OF_BEAMS, OF_OUTPUT = "linearity", "spectrum: other kV and filters", "output of the tube, dose"
+OF_OTHERS = "validation on flats that calibration has not seen"
 # frames of one value, and frames that are no detector numbers, have no pattern to compare
 NO_PATTERN = frozenset({FindingCode.CONSTANT, FindingCode.LOGARITHMS, FindingCode.SATURATED})
 UNFIT = NO_PATTERN | {
@@ -96,101 +100,127 @@ def _serves(item: Series, codes: set[FindingCode]) -> tuple[str, ...]:
     return tuple(serves)
 
 
-def allowed_by(
-    acquisition: AcquisitionFile, rows: Sequence[SeriesRow], findings: Sequence[Finding]
-) -> tuple[Allowed, ...]:
+def allowed_by(acquisition: AcquisitionFile, rows: Sequence[SeriesRow]) -> tuple[Allowed, ...]:
     """What can be learnt from the series as they stand."""
-    by_name = {item.name: item for item in acquisition.series}
-    instrument = acquisition.instrument
-
-    def serving(purpose: str) -> list[SeriesRow]:
-        return [row for row in rows if purpose in row.serves_for]
-
-    def names(found: Sequence[SeriesRow]) -> str:
-        told = ", ".join(row.name for row in found[:3])
-        return told + (f" and {len(found) - 3} more" if len(found) > 3 else "")
-
-    result = []
-
-    def add(what: str, possible: bool, why: str) -> None:
-        result.append(Allowed(what=what, possible=possible, why=why))
-
-    darks, quiet = serving(DARK_LEVEL), serving(READ_NOISE)
-    offset_done = any("offset" in item.corrected for item in acquisition.of_kind("flat"))
-    if darks:
-        add("dark level", True, names(darks))
-    elif instrument.counting:
-        add("dark level", True, "0, of a detector that counts photons")
-    else:
-        add("dark level", offset_done, "the frames are offset-corrected" if offset_done else "no dark series")
-    add("read noise", bool(quiet), names(quiet) or "no dark series of two or more raw frames")
-    noisy, lit = serving(NOISE), serving(LEVEL)
-    pairs = _averaged_pairs([by_name[row.name] for row in lit if row.frames == 1])
-    add(
-        "gain, blur and photons a pixel",
-        bool(noisy) or bool(pairs),
-        names(noisy)
-        or (
-            f"the difference of {pairs[0]} and {pairs[1]}"
-            if pairs
-            else "no flat series of two or more raw frames of one scene"
-        ),
+    series = _Serving(acquisition, rows)
+    return (
+        _dark_level(series),
+        _read_noise(series),
+        _gain_and_blur(series),
+        _linearity(series),
+        _spectrum(series),
+        _output(series),
+        _validation(series),
+        _attenuation(series),
+        _reference_images(series),
+        _lag(series),
     )
-    spectral = [by_name[row.name] for row in serving(SPECTRUM)]
-    beams = {(item.kV, text_from_filters(item.filters)) for item in spectral}
+
+
+class _Serving:
+    """The series of an acquisition by what they serve for."""
+
+    def __init__(self, acquisition: AcquisitionFile, rows: Sequence[SeriesRow]) -> None:
+        self.acquisition, self._rows = acquisition, rows
+        self._series = {item.name: item for item in acquisition.series}
+
+    def rows(self, purpose: str) -> list[SeriesRow]:
+        return [row for row in self._rows if purpose in row.serves_for]
+
+    def series(self, purpose: str) -> list[Series]:
+        return [self._series[row.name] for row in self.rows(purpose)]
+
+    def names(self, purpose: str) -> str:
+        """Names of the series that serve for something, in words; empty where none does."""
+        return _names([row.name for row in self.rows(purpose)])
+
+
+def _names(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def _dark_level(series: _Serving) -> Allowed:
+    darks = series.names(DARK_LEVEL)
+    if darks:
+        return Allowed(what=OF_DARKS, possible=True, why=darks)
+    if series.acquisition.instrument.counting:
+        return Allowed(what=OF_DARKS, possible=True, why="0, of a detector that counts photons")
+    done = any("offset" in item.corrected for item in series.acquisition.of_kind("flat"))
+    return Allowed(what=OF_DARKS, possible=done, why="the frames are offset-corrected" if done else "no dark series")
+
+
+def _read_noise(series: _Serving) -> Allowed:
+    quiet = series.names(READ_NOISE)
+    return Allowed(what=OF_READ_NOISE, possible=bool(quiet), why=quiet or "no dark series of two or more raw frames")
+
+
+def _gain_and_blur(series: _Serving) -> Allowed:
+    noisy = series.names(NOISE)
+    if noisy:
+        return Allowed(what=OF_NOISE, possible=True, why=noisy)
+    pair = _averaged_pairs([item for item in series.series(LEVEL) if item.n_frames == 1])
+    if pair is not None:
+        return Allowed(what=OF_NOISE, possible=True, why=f"the difference of {pair[0]} and {pair[1]}")
+    return Allowed(what=OF_NOISE, possible=False, why="no flat series of two or more raw frames of one scene")
+
+
+def _linearity(series: _Serving) -> Allowed:
     loads = max(
         (
             len({(item.current_mA, item.power_W, item.exposure_ms, item.photons_per_pixel) for item in group})
-            for group in _grouped([by_name[row.name] for row in lit])
+            for group in _grouped(series.series(LEVEL))
         ),
         default=0,
     )
-    add(
-        "linearity",
-        loads > 2,
-        f"{loads} loads at one beam" if loads > 2 else "three or more loads at one beam are needed",
-    )
-    add(
-        "spectrum: other kV and filters",
-        bool(spectral),
-        f"{len(beams)} beam{'s' * (len(beams) != 1)}: "
-        + "; ".join(f"{kV:g} kV {layers}".strip() for kV, layers in sorted(beams)[:4])
-        if spectral
-        else "flats need kV, current or power, and an exposure time",
-    )
+    why = f"{loads} loads at one beam" if loads > 2 else "three or more loads at one beam are needed"
+    return Allowed(what=OF_LOADS, possible=loads > 2, why=why)
+
+
+def _spectrum(series: _Serving) -> Allowed:
+    beams = {(item.kV, text_from_filters(item.filters)) for item in series.series(SPECTRUM)}
+    if not beams:
+        why = "flats need kV, current or power, and an exposure time"
+        return Allowed(what=OF_BEAMS, possible=False, why=why)
+    named = "; ".join(f"{kV:g} kV {layers}".strip() for kV, layers in sorted(beams)[:4])
+    return Allowed(what=OF_BEAMS, possible=True, why=f"{counted(len(beams), 'beam')}: {named}")
+
+
+def _output(series: _Serving) -> Allowed:
+    instrument, spectral = series.acquisition.instrument, series.series(SPECTRUM)
     distance = instrument.source_detector_mm is not None or any(item.source_detector_mm for item in spectral)
-    absolute = bool(spectral) and distance and instrument.pixel_mm is not None
-    add(
-        "output of the tube, dose",
-        absolute,
+    known = bool(spectral) and distance and instrument.pixel_mm is not None
+    why = (
         "kV, load, pixel size and distance are known"
-        if absolute
-        else "needs kV, load, pixel size and source-detector distance",
+        if known
+        else "needs kV, load, pixel size and source-detector distance"
     )
-    evaluated = serving(VALIDATION)
-    add(
-        "validation on flats that calibration has not seen",
-        bool(evaluated),
-        names(evaluated) or 'no flat with role = "evaluation"',
-    )
-    known = [item for item in acquisition.of_kind("object") if _has_thickness(acquisition, item)]
-    add(
-        "attenuation and scatter",
-        bool(known),
-        names([row for row in rows if row.name in {item.name for item in known}]) or "no object of known thickness",
-    )
+    return Allowed(what=OF_OUTPUT, possible=known, why=why)
+
+
+def _validation(series: _Serving) -> Allowed:
+    evaluated = series.names(VALIDATION)
+    return Allowed(what=OF_OTHERS, possible=bool(evaluated), why=evaluated or 'no flat with role = "evaluation"')
+
+
+def _attenuation(series: _Serving) -> Allowed:
+    objects = series.acquisition.of_kind("object")
+    known = _names([item.name for item in objects if _has_thickness(series.acquisition, item)])
+    return Allowed(what="attenuation and scatter", possible=bool(known), why=known or "no object of known thickness")
+
+
+def _reference_images(series: _Serving) -> Allowed:
     try:
-        images = object_pairs(acquisition)
+        pairs = len(object_pairs(series.acquisition))
     except InputError:
-        images = ()
-    add(
-        "reference images for two energies",
-        bool(images),
-        counted(len(images), "pair") if images else "no object measured at two tube voltages with a `scene`",
-    )
-    afterglow = serving(LAG)
-    add("lag", bool(afterglow), names(afterglow) or "no afterglow series (beam off straight after exposure)")
-    return tuple(result)
+        pairs = 0
+    why = counted(pairs, "pair") if pairs else "no object measured at two tube voltages with a `scene`"
+    return Allowed(what="reference images for two energies", possible=bool(pairs), why=why)
+
+
+def _lag(series: _Serving) -> Allowed:
+    afterglow = series.names(LAG)
+    why = afterglow or "no afterglow series (beam off straight after exposure)"
+    return Allowed(what="lag", possible=bool(afterglow), why=why)
 
 
 def _has_thickness(acquisition: AcquisitionFile, item: Series) -> bool:
@@ -224,15 +254,15 @@ def next_measurements(
     """What would be worth measuring or writing down next, most useful first."""
     possible = {item.what: item.possible for item in allows}
     told = []
-    if not possible["dark level"]:
+    if not possible[OF_DARKS]:
         told.append("20 darks at each exposure time (beam off)")
-    elif not possible["read noise"] and not acquisition.instrument.counting:
+    elif not possible[OF_READ_NOISE] and not acquisition.instrument.counting:
         told.append("20 raw darks at one exposure time, each kept by itself")
-    if not possible["gain, blur and photons a pixel"]:
+    if not possible[OF_NOISE]:
         told.append("20 raw flats at each of five currents or exposures, each frame kept by itself")
-    elif not possible["linearity"]:
+    elif not possible[OF_LOADS]:
         told.append("flats at five exposures of one beam, from a tenth to nine tenths of full scale")
-    if not possible["spectrum: other kV and filters"]:
+    if not possible[OF_BEAMS]:
         told.append("write down kV, mA (or W) and exposure of every flat")
     else:
         spectral = [row for row in rows if SPECTRUM in row.serves_for]
@@ -246,8 +276,8 @@ def next_measurements(
             told.append("the same flats behind a known filter (0.1 mm Cu or 2 mm Al)")
         if len(voltages) == 2:
             told.append("flats at a third tube voltage: two do not tell what lies beyond them")
-        if not possible["output of the tube, dose"]:
+        if not possible[OF_OUTPUT]:
             told.append("write down pixel size and source-detector distance")
-    if not possible["validation on flats that calibration has not seen"] and possible["gain, blur and photons a pixel"]:
+    if not possible[OF_OTHERS] and possible[OF_NOISE]:
         told.append('a flat at another setting with role = "evaluation", to test the twin on')
     return tuple(told)

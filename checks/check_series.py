@@ -99,7 +99,7 @@ def check_series(acquisition: AcquisitionFile, *, progress: Progress | None = No
         )
         for item in acquisition.series
     )
-    allows = allowed_by(acquisition, rows, findings)
+    allows = allowed_by(acquisition, rows)
     return CheckResult(
         path=acquisition.path,
         what="acquisition",

@@ -86,44 +86,42 @@ def priors_for(
     geometry_declared: bool = True,
     threshold_keV: float | None = None,
 ) -> dict[str, Prior]:
-    """The priors of a model's parameters, in the order of its names; threshold_keV: that a counter's owner declares."""
-    result = {}
+    """The priors of a model's parameters, in the order of its names.
+
+    Args:
+        model: says which parameters there are, and whether a measured spectrum takes the place of the tube's.
+        scintillator_declared: whether its thickness is known.
+        geometry_declared: whether pixel and distance are, so that the output is on an absolute scale.
+        threshold_keV: that a counter's owner declares.
+    """
+    known = DOSE_PRIORS | PRIORS
+    known[THRESHOLD] = UNDECLARED_THRESHOLD
+    if threshold_keV is not None:
+        known[THRESHOLD] = replace(
+            UNDECLARED_THRESHOLD,
+            centre=threshold_keV,
+            sd=THRESHOLD_SD_KEV,
+            reason="threshold of the counter, as declared",
+        )
+    share = GADOLINIUM_SHARE
+    known[ALTERNATIVE_SCINTILLATOR] = Prior(
+        centre=share, sd=math.sqrt(share * (1.0 - share)), reason="0 is CsI, 1 Gd2O2S: not declared"
+    )
+    if not scintillator_declared:
+        known["log_scintillator_thickness"] = UNDECLARED_SCINTILLATOR
+    if not geometry_declared:
+        known |= {"log_output": FREE_OUTPUT, KERMA_OUTPUT: FREE_KERMA_OUTPUT}
+    if model.correction is not None:
+        known |= MEASURED_SPECTRUM
+        if model.correction.relative:
+            known["log_output"] = FREE_OUTPUT
+    if model.counting:
+        known["log_swank"] = COUNTING_SWANK
     for name in model.names:
-        if name == "log_scintillator_thickness" and not scintillator_declared:
-            result[name] = UNDECLARED_SCINTILLATOR
-        elif name in MEASURED_SPECTRUM and model.correction is not None:
-            result[name] = MEASURED_SPECTRUM[name]
-        elif name == "log_output" and (
-            not geometry_declared or (model.correction is not None and model.correction.relative)
-        ):
-            result[name] = FREE_OUTPUT
-        elif name == "log_swank" and model.counting:
-            result[name] = COUNTING_SWANK
-        elif name == THRESHOLD and threshold_keV is not None:
-            result[name] = replace(
-                UNDECLARED_THRESHOLD,
-                centre=threshold_keV,
-                sd=THRESHOLD_SD_KEV,
-                reason="threshold of the counter, as declared",
-            )
-        elif name == THRESHOLD:
-            result[name] = UNDECLARED_THRESHOLD
-        elif name == ALTERNATIVE_SCINTILLATOR:
-            share = GADOLINIUM_SHARE
-            result[name] = Prior(
-                centre=share, sd=math.sqrt(share * (1.0 - share)), reason="0 is CsI, 1 Gd2O2S: not declared"
-            )
-        elif name in PRIORS:
-            result[name] = PRIORS[name]
-        elif name == KERMA_OUTPUT and not geometry_declared:
-            result[name] = FREE_KERMA_OUTPUT
-        elif name in DOSE_PRIORS:
-            result[name] = DOSE_PRIORS[name]
-        elif any(name.startswith(f"{table}_") for table in OTHER_TABLES):
-            result[name] = TABLE_SHARE
-        else:
-            result[name] = ATTENUATION_SCALE
-    return result
+        if name not in known:
+            of_table = any(name.startswith(f"{table}_") for table in OTHER_TABLES)
+            known[name] = TABLE_SHARE if of_table else ATTENUATION_SCALE
+    return {name: known[name] for name in model.names}
 
 
 def counter_priors(levels: Sequence[Level]) -> dict[str, Prior]:

@@ -1,8 +1,8 @@
 """What an effect of the lab is: how it is asked for, where it is planted, its unit and range."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -61,3 +61,34 @@ class EffectLaw:
     signed: bool = False
     known: bool = True
     drawn: bool = True
+
+    def plant(self, request: Asked, site: Site) -> Planted:
+        """The effect as it acts, with the unit of its strength."""
+        return replace(self.build(request, site), unit=self.unit)
+
+
+def effect_law(
+    name: str,
+    title: str,
+    unit: str,
+    span: tuple[float, float],
+    build: Build,
+    *,
+    since: str = "always",
+    **more: bool,
+) -> EffectLaw:
+    """A law in one line of a table; span: low and high of its strength; more: flags of `EffectLaw`."""
+    return EffectLaw(id=name, title=title, unit=unit, low=span[0], high=span[1], since=since, build=build, **more)
+
+
+def planted(request: Asked, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
+    """What a law builds: the words of its request, and where the effect acts; `EffectLaw.plant` adds the unit."""
+    return Planted(
+        id=request.id,
+        strength=request.strength,
+        unit="",
+        since=request.since or "always",
+        law=law,
+        parameters=parameters,
+        **hooks,
+    )

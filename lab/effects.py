@@ -98,8 +98,7 @@ def plant(requests: Sequence[EffectRequest], site: Site) -> tuple[Planted, ...]:
             continue
         rng = np.random.default_rng(int(seeds[order.index(request.id)]))
         own = Site(system=site.system, geometry=site.geometry, plan=site.plan, rng=rng)
-        since = request.since or EFFECTS[request.id].since
-        planted.append(
-            EFFECTS[request.id].build(EffectRequest(id=request.id, strength=request.strength, since=since), own)
-        )
+        law = EFFECTS[request.id]
+        asked = EffectRequest(id=request.id, strength=request.strength, since=request.since or law.since)
+        planted.append(law.plant(asked, own))
     return tuple(planted)

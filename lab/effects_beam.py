@@ -1,9 +1,7 @@
 """Effects of tube, geometry and object: what the beam is before it reaches the scintillator."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +9,8 @@ from numpy.typing import NDArray
 from ..acquisition.setting import Filter
 from .attenuation import mu_per_mm
 from .chain import SUBPIXELS, margin_px
-from .effect import Asked, EffectLaw, Site
-from .effects_detector import mixed_gaussians, planted
+from .effect import Asked, EffectLaw, Site, effect_law, planted
+from .effects_detector import mixed_gaussians
 from .line import MINERAL, Exposure, FineMap, FineRates, Planted, rates_of_map
 from .objects import PRODUCT_MATERIAL, fine_shape
 from .phantoms import Posed
@@ -29,7 +27,7 @@ def _kv_error(request: Asked, site: Site) -> Planted:
         true = (1.0 + system.kV_offset_percent / 100.0) * (1.0 + request.strength / 100.0)
         return replace(system, kV_offset_percent=100.0 * (true - 1.0))
 
-    return _told(request, "the tube's true voltage over the set one", {}, system=change)
+    return planted(request, "the tube's true voltage over the set one", {}, system=change)
 
 
 def _filtration_error(request: Asked, site: Site) -> Planted:
@@ -38,7 +36,7 @@ def _filtration_error(request: Asked, site: Site) -> Planted:
     def change(system: LabSystem) -> LabSystem:
         return replace(system, inherent_filtration=(*system.inherent_filtration, layer))
 
-    return _told(request, "one more layer of aluminium", {}, system=change)
+    return planted(request, "one more layer of aluminium", {}, system=change)
 
 
 def _output_drift(request: Asked, site: Site) -> Planted:
@@ -65,7 +63,7 @@ def _output_drift(request: Asked, site: Site) -> Planted:
     def load(clock_s: float) -> float:
         return 1.0 + request.strength / 100.0 * (wave(clock_s) - mean) / spread
 
-    return _told(
+    return planted(
         request,
         "two slow oscillations of cooling and supply, and a jitter from frame to frame",
         {"periods_s": [slow_s, quick_s], "shares_of_variance": [float(share) for share in shares]},
@@ -123,7 +121,7 @@ def _heel(request: Asked, site: Site) -> Planted:
             across = -across
         return {ANODE: (path_mm * (across + _HEEL_CURVE * across**2)).astype(np.float32)}
 
-    return _told(
+    return planted(
         request,
         "tungsten in the way of the beam, more and more of it towards one side: (u + 0.3 u^2) of a path that each kV"
         " has for itself",
@@ -173,7 +171,7 @@ def _grey_absorber(request: Asked, site: Site) -> Planted:
     def sheet(exposure: Exposure) -> dict[str, FineMap]:
         return {_FOIL: (thick_mm * hidden(exposure)).astype(np.float32)}
 
-    return _told(
+    return planted(
         request,
         "an aluminium foil with a wedged rim" if foil else "a mesh of opaque wires",
         {"direction_deg": degrees, "border": border, "bend": bend, "ramp": ramp, "foil": foil},
@@ -225,7 +223,7 @@ def _focal_spot(request: Asked, site: Site) -> Planted:
         kernel = _kernel(points * width_px, brightness)
         return _blurred(rates, (kernel, kernel))
 
-    return _told(request, "source points of triangular brightness in both directions", {}, rates=blur)
+    return planted(request, "source points of triangular brightness in both directions", {}, rates=blur)
 
 
 def _off_focal(request: Asked, site: Site) -> Planted:
@@ -253,7 +251,7 @@ def _off_focal(request: Asked, site: Site) -> Planted:
             out[:, :, number] = np.float32(1.0 - share) * plane + np.float32(share) * smooth
         return rates_of_map(out, rates)
 
-    return _told(
+    return planted(
         request,
         "a share of the photons comes from a wide spot around the focus",
         {"radius_mm": radius_mm, "aside_mm": aside_mm, "towards_rad": towards},
@@ -277,7 +275,7 @@ def _motion_blur(request: Asked, site: Site) -> Planted:
         places_px = travelled_mm * system.magnification / system.pixel_mm
         return _blurred(rates, (_kernel(places_px, np.ones(places_px.size)), None))
 
-    return _told(
+    return planted(
         request,
         "an object that travels along the rows' axis while it is exposed, its belt's speed rippling by 15 %",
         {"speed_mm_s": 1000.0 * mm_per_ms, "ripple_ms": cycle_ms},
@@ -303,7 +301,7 @@ def _misregistration(request: Asked, site: Site) -> Planted:
             rotation=true.rotation + rotation,
         )
 
-    return _told(
+    return planted(
         request,
         "a shift and a rotation of everything that is put on the bench",
         {"shift_px": shift_px, "direction_deg": math.degrees(direction), "rotation_deg": math.degrees(rotation)},
@@ -330,7 +328,7 @@ def _composition_error(request: Asked, site: Site) -> Planted:
             MINERAL: np.float32(mineral) * length,
         }
 
-    return _told(
+    return planted(
         request,
         "a denser product (85 % of the change) with more salt (15 % of it, at the middle energy)",
         {"middle_keV": float(middle_keV[0]), "salt_mm_per_mm": mineral},
@@ -393,7 +391,7 @@ def _object_scatter(request: Asked, site: Site) -> Planted:
         spelled = rates.spelled_out() + (signal_keV[..., None] * classes_per_keV).astype(np.float32)
         return rates_of_map(spelled, rates)
 
-    return _told(
+    return planted(
         request,
         "photons followed through up to four Compton and Rayleigh collisions, scaled for collimation and field",
         {
@@ -405,34 +403,23 @@ def _object_scatter(request: Asked, site: Site) -> Planted:
     )
 
 
-def _told(request: Asked, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
-    return planted(request, BEAM_UNITS[request.id], law, parameters, **hooks)
-
-
-_Build = Callable[[Asked, Site], Planted]
-
-
-def _law(name: str, title: str, unit: str, span: tuple[float, float], build: _Build, **more: Any) -> EffectLaw:
-    since = more.pop("since", "always")
-    return EffectLaw(id=name, title=title, unit=unit, low=span[0], high=span[1], since=since, build=build, **more)
-
-
 BEAM_LAWS: tuple[EffectLaw, ...] = (
-    _law("kv_error", "a tube voltage that changed", "%", (0.5, 5.0), _kv_error, since="calibration", signed=True),
-    _law("filtration_error", "more filtration", "mm Al", (0.03, 1.0), _filtration_error, since="calibration"),
-    _law("object_scatter", "radiation scattered by the object", "%", (1.0, 50.0), _object_scatter),
-    _law("focal_spot", "a source that is not a point", "mm", (0.05, 1.5), _focal_spot),
-    _law("motion_blur", "an object that moves", "px", (0.5, 10.0), _motion_blur),
-    _law("misregistration", "objects elsewhere than stated", "px", (0.1, 3.0), _misregistration),
-    _law("composition_error", "a product of other make", "%", (0.5, 5.0), _composition_error, signed=True),
-    _law("heel", "a beam that the anode dims on one side", "%", (1.0, 20.0), _heel, since="calibration"),
-    _law("output_drift", "an output that drifts", "%", (0.1, 3.0), _output_drift),
+    effect_law("kv_error", "a tube voltage that changed", "%", (0.5, 5.0), _kv_error, since="calibration", signed=True),
+    effect_law("filtration_error", "more filtration", "mm Al", (0.03, 1.0), _filtration_error, since="calibration"),
+    effect_law("object_scatter", "radiation scattered by the object", "%", (1.0, 50.0), _object_scatter),
+    effect_law("focal_spot", "a source that is not a point", "mm", (0.05, 1.5), _focal_spot),
+    effect_law("motion_blur", "an object that moves", "px", (0.5, 10.0), _motion_blur),
+    effect_law("misregistration", "objects elsewhere than stated", "px", (0.1, 3.0), _misregistration),
+    effect_law("composition_error", "a product of other make", "%", (0.5, 5.0), _composition_error, signed=True),
+    effect_law("heel", "a beam that the anode dims on one side", "%", (1.0, 20.0), _heel, since="calibration"),
+    effect_law("output_drift", "an output that drifts", "%", (0.1, 3.0), _output_drift),
 )
 # further ones come last in the registry: the random numbers of those before stay theirs
 COVER_LAWS: tuple[EffectLaw, ...] = (
-    _law("grey_absorber", "something in a part of the beam", "%", (0.5, 60.0), _grey_absorber, since="calibration"),
+    effect_law(
+        "grey_absorber", "something in a part of the beam", "%", (0.5, 60.0), _grey_absorber, since="calibration"
+    ),
 )
 SOURCE_LAWS: tuple[EffectLaw, ...] = (
-    _law("off_focal", "radiation from beside the focus", "%", (2.0, 20.0), _off_focal),
+    effect_law("off_focal", "radiation from beside the focus", "%", (2.0, 20.0), _off_focal),
 )
-BEAM_UNITS = {law.id: law.unit for law in (*BEAM_LAWS, *SOURCE_LAWS, *COVER_LAWS)}

@@ -1,7 +1,6 @@
 """Effects of the detector and its electronics: light that strays, charge that stays, responses, noises, bad pixels."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .chain import SUBPIXELS, FrameContext, Stage
-from .effect import Asked, EffectLaw, Site
+from .effect import Asked, EffectLaw, Site, effect_law, planted
 from .line import Exposure, FineRates, Planted, fine_rates, light_of_arrivals
 from .system import DetectorMaps, LabSystem
 
@@ -77,7 +76,7 @@ def _veiling_glare(request: Asked, site: Site) -> Planted:
         out: Map = np.float32(1.0 - share) * light + mixed_gaussians(light, parts)
         return out
 
-    return _told(
+    return planted(
         request,
         "light under the cover glass: three Gaussians in place of an exponential",
         {"mean_distance_mm": width_mm},
@@ -95,7 +94,7 @@ def _mtf_tail(request: Asked, site: Site) -> Planted:
         out: Map = np.float32(1.0 - weight) * light + mixed_gaussians(light, parts)
         return out
 
-    return _told(
+    return planted(
         request,
         "two Gaussians (60 and 40 % of the tail) behind the core's spread",
         {"sigma_inner_px": float(inner_px), "sigma_outer_px": float(outer_px)},
@@ -168,7 +167,7 @@ def _k_fluorescence(request: Asked, site: Site) -> Planted:
             light += np.float32(line_keV) * quanta[from_row][:, from_column]
         return light
 
-    return _told(
+    return planted(
         request,
         f"photons above the K edges leave {line_keV:g} keV in one of eight places around, on two rings",
         {"range_mm": range_mm, "places": [list(place) for place in offsets]},
@@ -252,7 +251,7 @@ def _image_lag(request: Asked, site: Site) -> Planted:
         read: Map = electrons * np.float32(1.0 - capture) + freed.sum(axis=0)
         return read
 
-    return _told(
+    return planted(
         request,
         "five kinds of traps with release times from 50 ms to 30 s, caught charge falling as a power of the time",
         {"power": power, "caught_share": capture, "times_s": list(TRAP_TIMES_S)},
@@ -280,7 +279,7 @@ def _nonlinearity(request: Asked, site: Site) -> Planted:
         out: Map = -full_electrons * np.expm1(-electrons / full_electrons)
         return out
 
-    return _told(
+    return planted(
         request,
         "a capacitor that charges: y = C (1 - exp(-x / C))",
         {"capacity_DN": full_DN, "highest_level_DN": highest_DN},
@@ -305,7 +304,7 @@ def _burn_in(request: Asked, site: Site) -> Planted:
         context.memory["burn_in"] = full + (1.0 - full) * reached, context.began_s
         return out
 
-    return _told(
+    return planted(
         request,
         "traps of the screen, half quick and half slow, that light fills only once",
         {"fills_after_exposures": fills_after, "empty_s": list(empty_s)},
@@ -326,7 +325,7 @@ def _pile_up(request: Asked, site: Site) -> Planted:
         out: Map = electrons * np.exp(-busy)
         return out
 
-    return _told(
+    return planted(
         request,
         "a counter whose dead time each photon prolongs: y = x exp(-x tau / t)",
         {"electrons_a_count": quantum},
@@ -356,7 +355,7 @@ def _threshold_error(request: Asked, site: Site) -> Planted:
             remote_keV=rates.remote_keV,
         )
 
-    return _told(
+    return planted(
         request,
         "a counter that no longer counts photons of 20 keV to so much more, its step a logistic curve",
         {"threshold_keV": _THRESHOLD_KEV, "width_keV": _COMPARATOR_KEV},
@@ -386,7 +385,7 @@ def _dark_drift(request: Asked, site: Site) -> Planted:
         out: Map = electrons + np.float32(extra_DN / context.system.DN_per_electron) * pattern
         return out
 
-    return _told(
+    return planted(
         request,
         "dark current of a panel that warms up: 1 - exp(-t / T), warmer on one side",
         {"settling_s": settle_s, "session_s": duration_s, "longest_exposure_ms": longest_ms},
@@ -412,7 +411,7 @@ def _gain_map_error(request: Asked, site: Site) -> Planted:
     def change(maps: DetectorMaps) -> DetectorMaps:
         return replace(maps, DN_per_electron=(maps.DN_per_electron * (1.0 + pattern)).astype(np.float32))
 
-    return _told(request, "a new pattern: a fifth of its variance smooth, the rest pixel by pixel", {}, maps=change)
+    return planted(request, "a new pattern: a fifth of its variance smooth, the rest pixel by pixel", {}, maps=change)
 
 
 def _bad_pixels(request: Asked, site: Site) -> Planted:
@@ -453,7 +452,7 @@ def _bad_pixels(request: Asked, site: Site) -> Planted:
         return replace(maps, DN_per_electron=conversion, dark_current_DN_per_ms=current, read_noise_DN=noise)
 
     places = [[row, column, what] for (row, column), what in sorted(kinds.items())]
-    return _told(
+    return planted(
         request,
         "new dead, hot and weak pixels, some in clusters or a line",
         {"pixels": wanted, "places": places},
@@ -465,7 +464,7 @@ def _excess_noise(request: Asked, site: Site) -> Planted:
     def change(system: LabSystem) -> LabSystem:
         return replace(system, light_swank=system.light_swank / (1.0 + request.strength / 100.0))
 
-    return _told(
+    return planted(
         request, "the light of a photon varies more: 1/A grows, a gamma law for each photon", {}, system=change
     )
 
@@ -485,7 +484,7 @@ def _row_noise(request: Asked, site: Site) -> Planted:
         out: Map = level_DN + (offsets[:, None] if along_rows else offsets[None, :])
         return out
 
-    return _told(
+    return planted(
         request,
         "offsets of lines with long tails (Student's t, 6 degrees), each its own or in bands",
         {"axis": "row" if along_rows else "column", "bands": bands},
@@ -501,7 +500,7 @@ def _quantisation(request: Asked, site: Site) -> Planted:
         numbers: NDArray[np.uint16] = np.asarray(np.clip(whole, 0, context.system.saturation_DN), dtype=np.uint16)
         return numbers
 
-    return _told(
+    return planted(
         request,
         "an ADC of coarser steps that truncates",
         {},
@@ -509,49 +508,26 @@ def _quantisation(request: Asked, site: Site) -> Planted:
     )
 
 
-def _told(request: Asked, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
-    return planted(request, DETECTOR_UNITS[request.id], law, parameters, **hooks)
-
-
-def planted(request: Asked, unit: str, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
-    """An effect as it acts, with the words of its request."""
-    return Planted(
-        id=request.id,
-        strength=request.strength,
-        unit=unit,
-        since=request.since or "always",
-        law=law,
-        parameters=parameters,
-        **hooks,
-    )
-
-
-_Build = Callable[[Asked, Site], Planted]
-
-
-def _law(name: str, title: str, unit: str, span: tuple[float, float], build: _Build, **more: Any) -> EffectLaw:
-    since = more.pop("since", "always")
-    return EffectLaw(id=name, title=title, unit=unit, low=span[0], high=span[1], since=since, build=build, **more)
-
-
 DETECTOR_LAWS: tuple[EffectLaw, ...] = (
-    _law("veiling_glare", "light that strays far", "%", (0.5, 5.0), _veiling_glare),
-    _law("mtf_tail", "a wide tail of the optical spread", "%", (2.0, 40.0), _mtf_tail, since="calibration"),
-    _law("k_fluorescence", "K photons caught at a distance", "%", (5.0, 40.0), _k_fluorescence),
-    _law("image_lag", "charge that is trapped and released later", "%", (0.02, 5.0), _image_lag),
-    _law("nonlinearity", "a response that saturates softly", "%", (0.3, 5.0), _nonlinearity, signed=True),
-    _law("dark_drift", "a dark level that drifts", "DN", (1.0, 100.0), _dark_drift),
-    _law("gain_map_error", "a gain map that changed", "%", (0.1, 3.0), _gain_map_error, since="calibration"),
-    _law("bad_pixels", "new bad pixels", "%", (0.02, 2.0), _bad_pixels, since="calibration"),
-    _law("excess_noise", "more noise than quanta alone bring", "%", (3.0, 100.0), _excess_noise, since="calibration"),
-    _law("row_noise", "offsets of lines, new in every frame", "sigma", (0.05, 2.0), _row_noise),
-    _law("quantisation", "lost bits", "DN", (2.0, 64.0), _quantisation),
+    effect_law("veiling_glare", "light that strays far", "%", (0.5, 5.0), _veiling_glare),
+    effect_law("mtf_tail", "a wide tail of the optical spread", "%", (2.0, 40.0), _mtf_tail, since="calibration"),
+    effect_law("k_fluorescence", "K photons caught at a distance", "%", (5.0, 40.0), _k_fluorescence),
+    effect_law("image_lag", "charge that is trapped and released later", "%", (0.02, 5.0), _image_lag),
+    effect_law("nonlinearity", "a response that saturates softly", "%", (0.3, 5.0), _nonlinearity, signed=True),
+    effect_law("dark_drift", "a dark level that drifts", "DN", (1.0, 100.0), _dark_drift),
+    effect_law("gain_map_error", "a gain map that changed", "%", (0.1, 3.0), _gain_map_error, since="calibration"),
+    effect_law("bad_pixels", "new bad pixels", "%", (0.02, 2.0), _bad_pixels, since="calibration"),
+    effect_law(
+        "excess_noise", "more noise than quanta alone bring", "%", (3.0, 100.0), _excess_noise, since="calibration"
+    ),
+    effect_law("row_noise", "offsets of lines, new in every frame", "sigma", (0.05, 2.0), _row_noise),
+    effect_law("quantisation", "lost bits", "DN", (2.0, 64.0), _quantisation),
 )
 # further ones come last in the registry: the random numbers of those before stay theirs
 MEMORY_LAWS: tuple[EffectLaw, ...] = (
-    _law("burn_in", "a screen that light makes brighter", "%", (0.05, 5.0), _burn_in),
-    _law("pile_up", "pulses that pile up", "ns", (10.0, 1000.0), _pile_up, drawn=False),
-    _law(
+    effect_law("burn_in", "a screen that light makes brighter", "%", (0.05, 5.0), _burn_in),
+    effect_law("pile_up", "pulses that pile up", "ns", (10.0, 1000.0), _pile_up, drawn=False),
+    effect_law(
         "threshold_error",
         "a threshold that rose",
         "keV",
@@ -561,4 +537,3 @@ MEMORY_LAWS: tuple[EffectLaw, ...] = (
         drawn=False,
     ),
 )
-DETECTOR_UNITS = {law.id: law.unit for law in (*DETECTOR_LAWS, *MEMORY_LAWS)}

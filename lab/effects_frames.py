@@ -5,8 +5,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from .chain import FrameContext, Stage
-from .effect import Asked, EffectLaw, Site
-from .effects_detector import frame_rng, planted
+from .effect import Asked, EffectLaw, Site, planted
+from .effects_detector import frame_rng
 from .line import Planted
 
 # --- frames that are lost ---------------------------------------------------------------------------------------------
@@ -31,7 +31,6 @@ def _dropped_frames(request: Asked, site: Site) -> Planted:
 
     return planted(
         request,
-        "%",
         "a grabber that stalls for 1.5 frames on average and stores its last frame again",
         {"stalls_a_frame": begins, "mean_stall_frames": _MEAN_STALL},
         stages=(("digitise", Stage(name="dropped_frames", apply=grab, additive=False)),),

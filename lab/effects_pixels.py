@@ -1,14 +1,13 @@
 """Effects of pixels and their neighbours, of tiles and readout lines: quanta that move, gains and lines that change."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .chain import SUBPIXELS, FrameContext, Stage
-from .effect import Asked, EffectLaw, Site
-from .effects_detector import Map, frame_rng, planted
+from .effect import Asked, EffectLaw, Site, planted
+from .effects_detector import Map, frame_rng
 from .line import Exposure, FineRates, Planted, rates_of_map
 from .system import DetectorMaps
 
@@ -68,7 +67,7 @@ def _crosstalk(request: Asked, site: Site) -> Planted:
             out[:, :, number] = np.maximum(oaconvolve(wide, kernel.astype(np.float32), mode="valid"), 0.0)
         return rates_of_map(out, rates)
 
-    return _told(
+    return planted(
         request,
         "quanta fly on in a random direction of space before they are counted, exponential free paths",
         {"path_px": path_px, "moved_share": moved},
@@ -101,7 +100,7 @@ def _tile_gain(request: Asked, site: Site) -> Planted:
     def change(maps: DetectorMaps) -> DetectorMaps:
         return replace(maps, DN_per_electron=(maps.DN_per_electron * (1.0 + pattern)).astype(np.float32))
 
-    return _told(
+    return planted(
         request,
         "amplifiers of chips that have aged, gamma-distributed losses; chips in columns or in a grid that the border cuts, in half of"
         " the cases with narrow pixels at their seams",
@@ -132,7 +131,7 @@ def _line_flicker(request: Asked, site: Site) -> Planted:
         out: Map = light * factor[:, None].astype(np.float32)
         return out
 
-    return _told(
+    return planted(
         request,
         "a rolling readout under a ripple of three harmonics whose phase wanders",
         {"cycles_a_line": cycles_a_line, "wander": wander},
@@ -159,16 +158,12 @@ def _random_telegraph(request: Asked, site: Site) -> Planted:
         out.ravel()[places] += np.where(state, height_DN, np.float32(0.0))
         return out
 
-    return _told(
+    return planted(
         request,
         "pixels whose dark level jumps between two values and stays for some frames",
         {"pixels": count},
         stages=(("readout", Stage(name="random_telegraph", apply=jump, additive=False)),),
     )
-
-
-def _told(request: Asked, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
-    return planted(request, PIXEL_UNITS[request.id], law, parameters, **hooks)
 
 
 PIXEL_LAWS: tuple[EffectLaw, ...] = (
@@ -211,4 +206,3 @@ JUMP_LAWS: tuple[EffectLaw, ...] = (
         build=_random_telegraph,
     ),
 )
-PIXEL_UNITS = {law.id: law.unit for law in (*PIXEL_LAWS, *JUMP_LAWS)}

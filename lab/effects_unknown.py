@@ -1,15 +1,15 @@
 """Effects that no catalogue of the twin holds: what a diagnosis must call unknown, with its place."""
 
 import math
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .chain import FrameContext, Stage
-from .effect import Asked, EffectLaw, Site
-from .effects_detector import Map, frame_rng, mixed_gaussians, planted
+from .effect import Asked, EffectLaw, Site, effect_law, planted
+from .effects_detector import Map, frame_rng, mixed_gaussians
 from .line import Planted
 
 
@@ -25,7 +25,7 @@ def _tile_offsets(request: Asked, site: Site) -> Planted:
         moved: Map = level_DN + offsets[row_of][:, column_of]
         return moved
 
-    return _told(
+    return planted(
         request,
         "a baseline that wanders from frame to frame, tile by tile",
         {"tile_px": tile},
@@ -45,7 +45,7 @@ def _sharpening(request: Asked, site: Site) -> Planted:
         image = numbers.astype(np.float32)
         return _digitised(image + np.float32(amount) * (image - mixed_gaussians(image, ((1.0, sigma_px),))), context)
 
-    return _told(
+    return planted(
         request,
         "an unsharp mask in the firmware",
         {"sigma_px": sigma_px},
@@ -70,7 +70,7 @@ def _compression(request: Asked, site: Site) -> Planted:
         back = idctn(stored, axes=(2, 3), norm="ortho").transpose(0, 2, 1, 3).reshape(image.shape)
         return _digitised(back[:rows, :columns], context)
 
-    return _told(
+    return planted(
         request,
         "8 x 8 blocks of cosine waves in steps that grow with their frequency",
         {},
@@ -86,7 +86,7 @@ def _lookup_table(request: Asked, site: Site) -> Planted:
         phase = 2.0 * math.pi * waves / context.system.saturation_DN * numbers.astype(np.float64) + begins
         return _digitised(numbers + request.strength * (np.sin(phase) - math.sin(begins)), context)
 
-    return _told(
+    return planted(
         request,
         "a look-up table that waves over the range of the numbers",
         {"waves": waves},
@@ -94,25 +94,11 @@ def _lookup_table(request: Asked, site: Site) -> Planted:
     )
 
 
-def _told(request: Asked, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
-    return planted(request, UNKNOWN_UNITS[request.id], law, parameters, **hooks)
-
-
-_Build = Callable[[Asked, Site], Planted]
-
-
-def _law(name: str, title: str, unit: str, span: tuple[float, float], build: _Build, since: str) -> EffectLaw:
-    return EffectLaw(
-        id=f"unknown:{name}", title=title, unit=unit, low=span[0], high=span[1], since=since, build=build, known=False
-    )
-
+_unknown = partial(effect_law, since="calibration", known=False)
 
 UNKNOWN_LAWS: tuple[EffectLaw, ...] = (
-    _law(
-        "tile_offsets", "offsets of tiles that wander", "read-noise sigmas", (0.05, 1.5), _tile_offsets, "calibration"
-    ),
-    _law("sharpening", "sharpening in the firmware", "%", (3.0, 80.0), _sharpening, "calibration"),
-    _law("compression", "lossy compression", "DN", (8.0, 200.0), _compression, "calibration"),
-    _law("lookup_table", "a look-up table that waves", "DN", (20.0, 400.0), _lookup_table, "calibration"),
+    _unknown("unknown:tile_offsets", "offsets of tiles that wander", "read-noise sigmas", (0.05, 1.5), _tile_offsets),
+    _unknown("unknown:sharpening", "sharpening in the firmware", "%", (3.0, 80.0), _sharpening),
+    _unknown("unknown:compression", "lossy compression", "DN", (8.0, 200.0), _compression),
+    _unknown("unknown:lookup_table", "a look-up table that waves", "DN", (20.0, 400.0), _lookup_table),
 )
-UNKNOWN_UNITS = {law.id: law.unit for law in UNKNOWN_LAWS}

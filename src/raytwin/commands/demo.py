@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 from ._answer import answer, say
+from ._size import size_from_text
 
 EXAMPLE = """example:
   raytwin demo -o demo
@@ -71,10 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
         if (value := getattr(arguments, name)) is not None
     }
     if arguments.size is not None:
-        rows, cross, columns = arguments.size.lower().partition("x")
-        if not (cross and rows.isdigit() and columns.isdigit()):
-            raise InputError("--size", received=arguments.size, expected="ROWSxCOLUMNS, for example 96x128")
-        changes["size"] = (int(rows), int(columns))
+        changes["size"] = size_from_text(arguments.size)
     ignored = [name for name in ("first_steps", "shared_steps") if name in changes]
     if ignored and not arguments.paper_size:
         raise InputError(

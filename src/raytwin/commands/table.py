@@ -14,6 +14,7 @@ from typing import Any
 
 from ..errors import InputError
 from ._answer import answer, say
+from ._size import size_from_text
 
 EXAMPLE = """examples:
   raytwin table -o table --workers 2                          # ten networks an exposure, some hours on two cores
@@ -125,10 +126,7 @@ def _plan_words(arguments: argparse.Namespace) -> dict[str, Any]:
         if getattr(arguments, name) is not None
     }
     if arguments.size is not None:
-        rows, cross, columns = arguments.size.lower().partition("x")
-        if not (cross and rows.isdigit() and columns.isdigit()):
-            raise InputError("--size", received=arguments.size, expected="ROWSxCOLUMNS, for example 96x128")
-        line["size"] = (int(rows), int(columns))
+        line["size"] = size_from_text(arguments.size)
     if arguments.exposures_ms is not None:
         try:
             words["exposures_ms"] = tuple(float(word) for word in arguments.exposures_ms.split(","))

@@ -14,6 +14,7 @@ from ..acquisition.series_roles import calibrating_names, commonest_shape
 from ..calibration.frames.bad_pixels import is_noisy
 from ..calibration.frames.code_steps import code_step
 from ..calibration.frames.frame_checks import LEVEL_CHANGE, SceneChange
+from ..calibration.frames.robust import robust_sd
 from ..calibration.spread.noise_power import SMALLEST_SQUARE_PX
 from ..errors import FileFormatError, InputError
 from . import frame_signs
@@ -242,7 +243,7 @@ def _level_jump(scan: SeriesScan, offset_DN: float) -> tuple[int, float] | None:
         return None
     steps = np.diff(signal) / typical
     at = int(np.argmax(np.abs(steps)))
-    usual = 1.4826 * float(np.median(np.abs(steps)))
+    usual = robust_sd(steps, about=0.0)
     # a jump lasts: flicker comes back
     lasting = float(np.mean(signal[at + 1 :]) - np.mean(signal[: at + 1])) / typical
     large = abs(steps[at]) > max(_JUMP, 6.0 * usual) and abs(lasting) > 0.5 * _JUMP

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.frames.code_steps import FALSE_ALARM, code_step
+from ..calibration.frames.robust import robust_sd
 
 _MOST_AVERAGED = 256
 _CODES_AT_TOP = 10
@@ -125,7 +126,7 @@ def pattern_of(mean_DN: NDArray[np.float64]) -> NDArray[np.float32]:
 
     smooth = uniform_filter(mean_DN, 5)
     pattern = mean_DN - smooth
-    spread = 1.4826 * float(np.median(np.abs(pattern - np.median(pattern))))
+    spread = robust_sd(pattern)
     if not spread > 0:
         return np.zeros(mean_DN.shape, dtype=np.float32)
     limited = np.clip(pattern / spread, -5.0, 5.0)
@@ -220,7 +221,7 @@ def most_uneven(mean_signal_DN: NDArray[np.float64], differences: NDArray[np.flo
         return math.inf
 
     def variance(values: NDArray[np.float64]) -> float:
-        return (1.4826 * float(np.median(np.abs(values - np.median(values))))) ** 2
+        return robust_sd(values) ** 2
 
     def steps(values: NDArray[np.float64]) -> float:
         return variance(np.diff(values, axis=-1)) / 2.0

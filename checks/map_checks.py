@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..calibration.frames.robust import robust_sd
 from .findings import Finding, FindingCode
 from .label_model import DEEPEST, INHERENT, INHERENT_TRIED_MM_AL, LabelModel, measured_depth
 from .readings import FloatArray, Reading
@@ -157,7 +158,7 @@ def _correlation(picture: FloatArray, depth: FloatArray, stride: int) -> float:
 
 def _of_neighbours(picture: FloatArray) -> float:
     """Standard deviation of a picture's noise (row, column), as most neighbours along rows differ."""
-    return 1.4826 * float(np.median(np.abs(np.diff(picture, axis=1)))) / math.sqrt(2.0)
+    return robust_sd(np.diff(picture, axis=1), about=0.0) / math.sqrt(2.0)
 
 
 def _scales_of_map(item: Reading, maps: LabelModel, inherent_mm_Al: float) -> list[float]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
-from ..files import CSV_UTF8, read_utf8, with_decimal_points
+from ..files import CSV_UTF8, is_number, read_utf8, with_decimal_points
 from ..results import ByValue, counted
 
 if TYPE_CHECKING:
@@ -303,7 +303,7 @@ def _read_sheet(path: Path) -> _Sheet:
         cells = [row[: len(cells[0]) - 1] for row in cells]  # an empty column at the right edge of a sheet
     header = [name.strip() for name in cells[0]]
     numbers = [n for n, _ in kept][1:]
-    if all(_is_number(name) for name in header):
+    if all(is_number(name) for name in header):
         raise FileFormatError(
             "table header",
             received=first,
@@ -322,14 +322,6 @@ def _read_sheet(path: Path) -> _Sheet:
         body = with_decimal_points(header, body, lines=numbers, argument=f"table {path}")
     rows = [["" if cell.strip() in _MISSING else cell for cell in row] for row in body]
     return _Sheet(header=header, rows=rows, places=[f"line {number}" for number in numbers])
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _filtered(sheet: _Sheet, where: Mapping[str, str]) -> _Sheet:

@@ -359,6 +359,49 @@ products = 8
     return make
 
 
+@pytest.fixture
+def refused_line(capsys):
+    """Called with the words of a command that must refuse its input: the one line that it prints, all on standard error."""
+    from raytwin.cli import main
+
+    def run(*words):
+        capsys.readouterr()
+        assert main([str(word) for word in words]) == 2
+        said = capsys.readouterr()
+        assert said.out == "" and said.err.count("\n") == 1, said
+        return said.err
+
+    return run
+
+
+@pytest.fixture
+def refused_import(refused_line):
+    """Called with the words of an import that must be refused and its output: the one line; nothing is left behind."""
+
+    def run(*words, out):
+        before = sorted(out.parent.iterdir())
+        line = refused_line("import", *words, "-o", out)
+        assert sorted(out.parent.iterdir()) == before and not out.exists()
+        return line
+
+    return run
+
+
+@pytest.fixture
+def json_of(capsys):
+    """Called with the words of a command: its answer, as --json prints it."""
+    import json
+
+    from raytwin.cli import main
+
+    def run(*words):
+        capsys.readouterr()
+        assert main([*map(str, words), "--json"]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    return run
+
+
 @pytest.fixture(scope="module")
 def browser():
     """Chromium, driven by Playwright; tests that ask for it are marked `browser` and run with `make test-page`."""

@@ -252,10 +252,9 @@ def test_a_result_is_short_equal_by_value_pickled_and_plain(inside, capsys, name
         if words is not None
     ],
 )
-def test_to_dict_is_what_the_command_prints(inside, capsys, name):
+def test_to_dict_is_what_the_command_prints(inside, capsys, name, json_of):
     found = made(name, capsys)
-    assert main([*RESULTS[name][1], "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == found.to_dict()
+    assert json_of(*RESULTS[name][1]) == found.to_dict()
 
 
 def test_values_that_differ_make_results_unequal(inside, capsys):

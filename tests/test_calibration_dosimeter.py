@@ -1,7 +1,6 @@
 """Dose and transmission tables: what a dosimeter says of a tube, alone and together with flats."""
 
 import csv
-import json
 import math
 import re
 import shlex
@@ -371,10 +370,10 @@ BAD_TRANSMISSION = {
 
 
 @pytest.mark.parametrize("option", ["--output-table", "--transmission"])
-def test_a_table_that_is_not_there_is_told_in_one_line(tmp_path, capsys, option):
-    assert main(["calibrate", option, str(tmp_path / "nope.csv"), "-o", str(tmp_path / "twin.h5")]) == 2
-    told = capsys.readouterr().err.strip().splitlines()
-    assert len(told) == 1 and f"{option} nope.csv: got no file that can be read" in told[0]
+def test_a_table_that_is_not_there_is_told_in_one_line(tmp_path, refused_line, option):
+    assert f"{option} nope.csv: got no file that can be read" in refused_line(
+        "calibrate", option, tmp_path / "nope.csv", "-o", tmp_path / "twin.h5"
+    )
     assert not any(tmp_path.iterdir())
 
 
@@ -393,16 +392,14 @@ def test_decimal_commas_are_read_where_no_comma_separates_columns(tmp_path, sepa
     + [("--transmission", *case) for case in BAD_TRANSMISSION.values()],
     ids=[*BAD_OUTPUT, *BAD_TRANSMISSION],
 )
-def test_a_bad_table_is_told_in_one_line(tmp_path, capsys, option, text, expected):
+def test_a_bad_table_is_told_in_one_line(tmp_path, refused_line, option, text, expected):
     path, twin = tmp_path / "table.csv", tmp_path / "twin.h5"
     path.write_text(text, encoding="utf-8", errors="surrogateescape")
-    assert main(["calibrate", option, str(path), "-o", str(twin)]) == 2
-    told = capsys.readouterr().err.strip().splitlines()
-    assert len(told) == 1 and expected in told[0]
+    assert expected in refused_line("calibrate", option, path, "-o", twin)
     assert not twin.exists()
 
 
-def test_the_page_of_the_dosimeter_runs_as_it_is_written(tmp_path, capsys, monkeypatch):
+def test_the_page_of_the_dosimeter_runs_as_it_is_written(tmp_path, capsys, monkeypatch, json_of):
     page = (Path(__file__).parents[1] / "docs" / "dosimeter.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     Path("doses.csv").write_text(re.search(r"```text\n(.*?)```", page, re.DOTALL).group(1))
@@ -410,8 +407,7 @@ def test_the_page_of_the_dosimeter_runs_as_it_is_written(tmp_path, capsys, monke
     for line in re.search(r"```bash\n(.*?)```", page, re.DOTALL).group(1).splitlines():
         words = shlex.split(line)[1:]
         capsys.readouterr()
-        assert main([*words, "--json"]) == 0
-        answers[words[0]] = json.loads(capsys.readouterr().out)
+        answers[words[0]] = json_of(*words)
     calibrated, spectrum, predicted = (answers[name] for name in ("calibrate", "spectrum", "predict"))
     assert calibrated["psf_sigma_px"] is None and calibrated["levels"] == [] and calibrated["bad_pixels"] is None
     assert calibrated["flux_scale"]["value"] == pytest.approx(0.9, rel=0.1) and calibrated["warnings"]

@@ -1,6 +1,5 @@
 """A session of the virtual lab from calibration to validation: the twin shares no physics with what it measures."""
 
-import json
 import shutil
 from dataclasses import replace
 
@@ -142,18 +141,15 @@ def test_the_spectral_posterior_names_what_flats_leave_open(session):
     assert spectral.calibrated_kV == (40.0, 90.0)
 
 
-def test_the_commands_give_the_same_twin_for_the_same_seed(session, tmp_path, capsys):
+def test_the_commands_give_the_same_twin_for_the_same_seed(session, tmp_path, json_of):
     answers = []
     for name in ("a.h5", "b.h5"):
-        assert main(["calibrate", str(session["path"]), "-o", str(tmp_path / name), "--seed", "3", "--json"]) == 0
-        answers.append(json.loads(capsys.readouterr().out))
+        answers.append(json_of("calibrate", session["path"], "-o", tmp_path / name, "--seed", "3"))
     assert answers[0] == answers[1]
-    assert main(["validate", str(tmp_path / "a.h5"), str(session["path"]), "--json"]) == 0
-    shown = json.loads(capsys.readouterr().out)
+    shown = json_of("validate", tmp_path / "a.h5", session["path"])
     assert shown["coverage"]["rows"] == 8
     words = ["predict", str(tmp_path / "a.h5"), "--kv", "60", "--filter", "Cu:0.05", "--power-w", "40"]
-    assert main([*words, "--exposure-ms", "20", "--json"]) == 0
-    predicted = json.loads(capsys.readouterr().out)
+    predicted = json_of(*words, "--exposure-ms", "20")
     row = next(row for row in shown["rows"] if row["kV"] == 60 and row["exposure_ms"] == 20)
     assert predicted["mean_DN"]["value"] == pytest.approx(row["mean_DN"]["value"])
     # the row's interval holds the measured series' own noise too

@@ -1,6 +1,5 @@
 """Wedges: their transmissions as measured, as predicted, in calibration and in validation."""
 
-import json
 import math
 
 import numpy as np
@@ -214,7 +213,7 @@ def test_an_unknown_material_lies_between_the_tables(measured):
     assert half_width > 1.95 * math.hypot(np.std(depths), 0.01 * depths[0])
 
 
-def test_validation_shows_wedges_and_levels_left_out(measured, tmp_path, capsys):
+def test_validation_shows_wedges_and_levels_left_out(measured, tmp_path, capsys, json_of):
     path, twin = measured
     with open_acquisition(path) as acquisition:
         result = validate_twin(twin, acquisition)
@@ -229,8 +228,7 @@ def test_validation_shows_wedges_and_levels_left_out(measured, tmp_path, capsys)
     write_twin(tmp_path / "twin.h5", twin)
     plot = tmp_path / "errors.png"
     arguments = ["validate", str(tmp_path / "twin.h5"), str(path), "--leave-one-out", "--plot", str(plot)]
-    assert main([*arguments, "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+    answer = json_of(*arguments)
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert len(answer["leave_one_out"]["rows"]) == 2
     assert answer["wedges"]["coverage"] == 1.0
@@ -293,16 +291,16 @@ def test_products_are_no_wedges(tmp_path, line, measured):
         assert measure_transmissions(acquisition, twin.maps) == ()
 
 
-def test_a_plot_of_unknown_kind_is_refused_before_any_work(measured, tmp_path, capsys):
-    assert main(["validate", "none.h5", "none.h5", "--plot", "errors.bmp"]) == 2
-    assert "a name that ends in .png, .pdf, .svg" in capsys.readouterr().err
+def test_a_plot_of_unknown_kind_is_refused_before_any_work(measured, tmp_path, refused_line):
+    assert "a name that ends in .png, .pdf, .svg" in refused_line(
+        "validate", "none.h5", "none.h5", "--plot", "errors.bmp"
+    )
 
 
 @pytest.mark.parametrize("text", ["tube.csv", "tube.csv:fast", "tube.csv:-3"])
-def test_a_spectrum_without_voltage_is_refused(measured, text, capsys, tmp_path):
+def test_a_spectrum_without_voltage_is_refused(measured, text, refused_line, tmp_path):
     path, _ = measured
-    assert main(["calibrate", str(path), "-o", str(tmp_path / "t.h5"), "--spectrum", text]) == 2
-    assert "expected FILE:kV" in capsys.readouterr().err
+    assert "expected FILE:kV" in refused_line("calibrate", path, "-o", tmp_path / "t.h5", "--spectrum", text)
 
 
 def test_a_twin_without_spectrum_predicts_no_transmission(measured):

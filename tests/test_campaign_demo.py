@@ -19,7 +19,6 @@ from raytwin.campaign.demo_gap import (
 )
 from raytwin.campaign.figures import exposures_chart, gap_parts, pod_chart, withheld_pictures
 from raytwin.campaign.report import _bounds, missing_a90
-from raytwin.cli import main
 from raytwin.diagnosis.report.figures import gap_chart
 from raytwin.generator.effects import AppliedEffect
 from raytwin.lab.protocols import run_protocol
@@ -187,8 +186,8 @@ def test_an_interval_says_which_bounds_it_has(low, high, told):
     assert _bounds(low, high) == told
 
 
-def test_options_of_the_shared_start_belong_to_the_papers_size(tmp_path, capsys):
-    assert main(["demo", "-o", str(tmp_path / "demo"), "--first-steps", "3"]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "--first-steps: got without --paper-size" in line
+def test_options_of_the_shared_start_belong_to_the_papers_size(tmp_path, refused_line):
+    assert "--first-steps: got without --paper-size" in refused_line(
+        "demo", "-o", tmp_path / "demo", "--first-steps", "3"
+    )
     assert not (tmp_path / "demo").exists()

@@ -313,10 +313,8 @@ def test_equivalence_is_stated_or_refused_with_the_reason(test, state, reason):
         (["--effect-networks", "0"], "networks of lines with an effect: got 0"),
     ],
 )
-def test_bad_options_are_one_line_and_make_no_folder(words, message, tmp_path, capsys):
-    assert main(["table", "-o", str(tmp_path / "table"), *words]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert message in line
+def test_bad_options_are_one_line_and_make_no_folder(words, message, tmp_path, refused_line):
+    assert message in refused_line("table", "-o", tmp_path / "table", *words)
     assert not (tmp_path / "table").exists()
 
 

@@ -1,6 +1,5 @@
 """`raytwin check`: what is broken is told in one line of the right series; what is good is not suspected; damage is told."""
 
-import json
 import math
 import re
 import sys
@@ -196,9 +195,8 @@ def test_a_series_of_another_shape_is_told_and_not_those_it_differs_from(session
     assert [item.series for item in found if item.code is FindingCode.SHAPES] == [order[0]]
 
 
-def test_the_json_answer_holds_what_scripts_read(session, capsys):
-    assert main(["check", str(session), "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+def test_the_json_answer_holds_what_scripts_read(session, json_of):
+    answer = json_of("check", session)
     assert {"series", "findings", "allows", "next_measurements"} <= set(answer)
     assert {"name", "kind", "setting", "frames", "serves_for"} <= set(answer["series"][0])
 
@@ -279,7 +277,7 @@ def test_bare_images_get_a_draft_of_a_sidecar(tmp_path, capsys):
     assert [item.code for item in result.findings] == [FindingCode.NO_SIDECAR]
 
 
-def test_a_draft_reads_settings_in_names_and_tells_even_light_from_a_product(tmp_path, capsys):
+def test_a_draft_reads_settings_in_names_and_tells_even_light_from_a_product(tmp_path, capsys, refused_line):
     rng = np.random.default_rng(0)
     row, column = np.mgrid[-1:1:64j, -1:1:64j]
     field = 1.0 - 0.15 * row - 0.2 * row**2 - 0.2 * column**2  # heel and distance
@@ -315,8 +313,9 @@ def test_a_draft_reads_settings_in_names_and_tells_even_light_from_a_product(tmp
         r"raytwin.toml, series 4, kind of .* got '\?'; expected one of dark, flat", capsys.readouterr().err
     )
     (tmp_path / "raytwin.toml").write_text(draft.replace('"?"', '"object"').replace("kv=90", "kv=0"))
-    assert main(["import", "images", str(tmp_path), "-o", str(tmp_path / "out.h5")]) == 2
-    assert "raytwin.toml, series 2, kV: got 0.0 kV" in capsys.readouterr().err
+    assert "raytwin.toml, series 2, kV: got 0.0 kV" in refused_line(
+        "import", "images", tmp_path, "-o", tmp_path / "out.h5"
+    )
     assert not (tmp_path / "out.h5").exists()
 
 

@@ -109,49 +109,37 @@ def test_an_effect_left_out_is_not_named(sessions, capsys):
         (["--twin", "missing.h5"], "missing.h5"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing_behind(sessions, capsys, words, mention):
-    capsys.readouterr()
+def test_bad_input_is_one_line_and_leaves_nothing_behind(sessions, words, mention, refused_line):
     folder = sessions / "bad"
-    assert main(["diagnose", str(sessions / "null.h5"), "-o", str(folder), *words]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    assert mention in lines[0]
+    assert mention in refused_line("diagnose", sessions / "null.h5", "-o", folder, *words)
     assert not folder.exists()
 
 
 @pytest.mark.parametrize("name", ["a_file", "a_file/below"])
-def test_folder_that_cannot_be_written_is_said_before_the_work_begins(sessions, tmp_path, capsys, name):
+def test_folder_that_cannot_be_written_is_said_before_the_work_begins(sessions, tmp_path, refused_line, name):
     (tmp_path / "a_file").write_text("taken", encoding="utf-8")
-    capsys.readouterr()
-    assert main(["diagnose", str(sessions / "null.h5"), "-o", str(tmp_path / name)]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    assert "expected a folder that can be written" in lines[0]
+    assert "expected a folder that can be written" in refused_line(
+        "diagnose", sessions / "null.h5", "-o", tmp_path / name
+    )
     assert (tmp_path / "a_file").read_text(encoding="utf-8") == "taken"
 
 
 @pytest.mark.parametrize("content", [b"", b"no HDF5 at all", None])
-def test_file_that_is_no_acquisition_is_one_line_and_leaves_no_folder(sessions, tmp_path, capsys, content):
+def test_file_that_is_no_acquisition_is_one_line_and_leaves_no_folder(sessions, tmp_path, refused_line, content):
     path = tmp_path / "session.h5"
     # None: a copy that was cut off
     path.write_bytes((sessions / "null.h5").read_bytes()[:100_000] if content is None else content)
-    capsys.readouterr()
-    assert main(["diagnose", str(path), "-o", str(tmp_path / "new" / "answer")]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    assert "expected an acquisition file" in lines[0]
+    assert "expected an acquisition file" in refused_line("diagnose", path, "-o", tmp_path / "new" / "answer")
     assert not (tmp_path / "new").exists()
 
 
-def test_only_darks_whose_noise_was_cut_off_are_one_line(tmp_path, capsys):
+def test_only_darks_whose_noise_was_cut_off_are_one_line(tmp_path, refused_line):
     frames = np.clip(4.0 * np.random.default_rng(3).standard_normal((6, 32, 32)), 0, None)
     with write_acquisition(tmp_path / "darks.h5") as writer:
         writer.add_series("dark", kind="dark", exposure_ms=20.0, frames=np.round(frames).astype(np.uint16))
-    assert main(["diagnose", str(tmp_path / "darks.h5"), "-o", str(tmp_path / "out")]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    assert "numbers are 0" in lines[0]
-    assert "expected series with light and noise" in lines[0]
+    line = refused_line("diagnose", tmp_path / "darks.h5", "-o", tmp_path / "out")
+    assert "numbers are 0" in line
+    assert "expected series with light and noise" in line
     assert not (tmp_path / "out").exists()
 
 

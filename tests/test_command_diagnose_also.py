@@ -8,7 +8,6 @@ from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.series_roles import calibrating_names
 from raytwin.acquisition.sessions import continued_session
 from raytwin.acquisition.setting import setting_from_text
-from raytwin.cli import main
 
 
 def write(path, *, kinds, role="calibration", pixel_mm=0.4):
@@ -39,17 +38,13 @@ def test_later_measurements_come_last_in_time_and_calibrate_nothing(tmp_path):
         assert calibrating_names(found.series) == {"dark_0", "flat_1"}
 
 
-def test_sessions_of_another_detector_do_not_join(tmp_path, capsys):
+def test_sessions_of_another_detector_do_not_join(tmp_path, refused_line):
     first = write(tmp_path / "first.h5", kinds=["dark", "flat"])
     other = write(tmp_path / "other.h5", kinds=["dark"], pixel_mm=0.2)
-    assert main(["diagnose", str(first), "-o", str(tmp_path / "no"), "--also", str(other)]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    assert "pixel_mm" in lines[0]
+    assert "pixel_mm" in refused_line("diagnose", first, "-o", tmp_path / "no", "--also", other)
 
 
 @pytest.mark.parametrize("name", ["missing.h5"])
-def test_a_file_that_is_not_there_is_named(tmp_path, capsys, name):
+def test_a_file_that_is_not_there_is_named(tmp_path, refused_line, name):
     first = write(tmp_path / "first.h5", kinds=["dark", "flat"])
-    assert main(["diagnose", str(first), "-o", str(tmp_path / "no"), "--also", str(tmp_path / name)]) == 2
-    assert name in capsys.readouterr().err
+    assert name in refused_line("diagnose", first, "-o", tmp_path / "no", "--also", tmp_path / name)

@@ -1,8 +1,6 @@
 """`raytwin spectrum` and `raytwin mu`: their answers, their options, and what they refuse."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -11,14 +9,8 @@ from raytwin.cli import main
 PAIR = ["--low", "kv=40,power_w=40,exposure_ms=20", "--high", "kv=90,power_w=45,exposure_ms=20"]
 
 
-def _answer(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
-    assert main([*words, "--json"]) == 0
-    answer: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return answer
-
-
-def test_spectrum_answers_with_what_the_interface_promises(capsys: pytest.CaptureFixture[str]) -> None:
-    answer = _answer(capsys, "spectrum", "--kv", "70", "--filter", "Al:23.5", "--filter", "air:1000", "--angle", "20")
+def test_spectrum_answers_with_what_the_interface_promises(json_of) -> None:
+    answer = json_of("spectrum", "--kv", "70", "--filter", "Al:23.5", "--filter", "air:1000", "--angle", "20")
     assert len(answer["energies_keV"]) == len(answer["fluence"]) == 138
     # IEC 61267 RQA5: first half-value layer 6.8 mm Al; PTB's tube of that filtration 6.64 mm
     assert answer["hvl_mm_Al"] == pytest.approx(6.64, rel=0.035)
@@ -50,42 +42,38 @@ def test_spectrum_speaks_to_people_and_warns_of_a_soft_beam(capsys: pytest.Captu
     ],
 )
 def test_mu_at_one_energy_is_nists_within_2_percent(
-    capsys: pytest.CaptureFixture[str], material: str, energy_keV: str, mass_attenuation: float, density: float
+    json_of, material: str, energy_keV: str, mass_attenuation: float, density: float
 ) -> None:
-    answer = _answer(capsys, "mu", material, "--energy-kev", energy_keV)
+    answer = json_of("mu", material, "--energy-kev", energy_keV)
     assert answer["density_g_cm3"] == density
     assert answer["mu_eff_per_mm"] == pytest.approx(mass_attenuation * density / 10, rel=0.02)
     assert answer["mu_eff_at_thickness_per_mm"] is None
 
 
-def test_mu_in_a_beam_gives_the_thin_limit_and_the_lower_value_through_a_thickness(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_mu_in_a_beam_gives_the_thin_limit_and_the_lower_value_through_a_thickness(json_of) -> None:
     words = ("mu", "chicken_breast", "--kv", "40", "--filter", "Al:1+Cu:0.05", "--thickness-mm", "20")
-    answer = _answer(capsys, *words)
+    answer = json_of(*words)
     assert 0.02 < answer["mu_eff_at_thickness_per_mm"] < answer["mu_eff_per_mm"] < 0.1
-    counting = _answer(capsys, *words, "--counting")
+    counting = json_of(*words, "--counting")
     assert counting["mu_eff_per_mm"] > answer["mu_eff_per_mm"]
-    screen = _answer(capsys, *words, "--scintillator", "Gd2O2S@4.5:0.2", "--cover", "C:1")
+    screen = json_of(*words, "--scintillator", "Gd2O2S@4.5:0.2", "--cover", "C:1")
     assert screen["mu_eff_per_mm"] != answer["mu_eff_per_mm"]
-    chantler = _answer(capsys, *words, "--table", "chantler")
+    chantler = json_of(*words, "--table", "chantler")
     assert chantler["mu_eff_per_mm"] == pytest.approx(answer["mu_eff_per_mm"], rel=0.05)
 
 
-def test_a_nist_name_with_a_comma_is_a_filter_too(capsys: pytest.CaptureFixture[str]) -> None:
-    answer = _answer(capsys, "spectrum", "--kv", "60", "--filter", "Water, Liquid:10")
-    same = _answer(capsys, "spectrum", "--kv", "60", "--filter", "water:10")
+def test_a_nist_name_with_a_comma_is_a_filter_too(json_of) -> None:
+    answer = json_of("spectrum", "--kv", "60", "--filter", "Water, Liquid:10")
+    same = json_of("spectrum", "--kv", "60", "--filter", "water:10")
     assert answer["hvl_mm_Al"] == pytest.approx(same["hvl_mm_Al"], rel=1e-4)
 
 
-def test_own_materials_and_a_measured_spectrum_take_part(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_own_materials_and_a_measured_spectrum_take_part(json_of, tmp_path: Path) -> None:
     library = tmp_path / "own.toml"
     library.write_text('[putty]\ndensity_g_cm3 = 1.9\nformula = "CaCO3"\nsource = "data sheet"\n', encoding="utf-8")
     spectrum = tmp_path / "beam.txt"
     spectrum.write_text("".join(f"{energy} 1\n" for energy in range(20, 40)), encoding="utf-8")
-    answer = _answer(
-        capsys, "mu", "putty", "--spectrum-file", str(spectrum), "--library", str(library), "--filter", "putty:1"
-    )
+    answer = json_of("mu", "putty", "--spectrum-file", str(spectrum), "--library", str(library), "--filter", "putty:1")
     assert answer["density_g_cm3"] == 1.9
     assert answer["mu_eff_per_mm"] > 0
 

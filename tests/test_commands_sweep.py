@@ -38,9 +38,8 @@ def campaign(tmp_path_factory, make_sweep_line):
     return folder / "campaign.toml"
 
 
-def test_plan_trains_nothing_and_tells_what_is_known_before(campaign, capsys):
-    assert main(["sweep", str(campaign), "--plan", "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+def test_plan_trains_nothing_and_tells_what_is_known_before(campaign, capsys, json_of):
+    answer = json_of("sweep", campaign, "--plan")
     assert (answer["settings"], answer["feasible"], answer["to_train"]) == (2, 1, 1)
     slow, fast = answer["rows"]
     assert "asked for are 15 products/s" in slow["reason"] and not slow["kept"]
@@ -51,12 +50,11 @@ def test_plan_trains_nothing_and_tells_what_is_known_before(campaign, capsys):
     assert "2 settings, 1 feasible, 1 to train" in text and "22.7" in text
 
 
-def test_references_that_leave_nothing_to_try_are_refused_by_plan_and_run_alike(campaign, capsys, tmp_path):
+def test_references_that_leave_nothing_to_try_are_refused_by_plan_and_run_alike(campaign, refused_line, tmp_path):
     untried = campaign.with_name("untried.toml")
     untried.write_text(CAMPAIGN.replace("test_share = 0.4", "test_share = 0"))
     for words in (["--plan"], ["-o", str(tmp_path / "sweep")]):
-        assert main(["sweep", str(untried), *words]) == 2
-        assert "got 0 images to try networks on" in capsys.readouterr().err
+        assert "got 0 images to try networks on" in refused_line("sweep", untried, *words)
     assert not (tmp_path / "sweep").exists()
 
 
@@ -92,10 +90,9 @@ def test_a_sweep_writes_its_answer_and_prints_the_same_rows_with_their_time(camp
         (["CAMPAIGN", "-o", "CAMPAIGN"], "-o: got"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(campaign, capsys, tmp_path, monkeypatch, words, message):
+def test_bad_input_is_one_line_and_exit_code_2(campaign, refused_line, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
-    assert main(["sweep", *(str(campaign) if word == "CAMPAIGN" else word for word in words)]) == 2
-    error = capsys.readouterr().err
+    error = refused_line("sweep", *(campaign if word == "CAMPAIGN" else word for word in words))
     assert message in error
     assert len(error.strip().splitlines()) == 1
     assert not (tmp_path / "X").exists()

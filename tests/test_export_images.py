@@ -98,9 +98,8 @@ def dataset(tmp_path):
     return path
 
 
-def test_coco_annotations_and_pictures_give_masks_and_values_back(dataset, tmp_path, capsys):
-    assert main(["export", str(dataset), "--to", "coco", "-o", str(tmp_path / "coco"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["to"] == "coco"
+def test_coco_annotations_and_pictures_give_masks_and_values_back(dataset, tmp_path, json_of):
+    assert json_of("export", dataset, "--to", "coco", "-o", tmp_path / "coco")["to"] == "coco"
     seen = set()
     with read_dataset(dataset) as pairs:
         for split in ("train", "val", "test"):
@@ -314,10 +313,11 @@ def test_what_a_form_cannot_hold_is_one_line_and_leaves_nothing(request, tmp_pat
     assert [one.name for one in (tmp_path / "full").iterdir()] == ["kept.txt"]
 
 
-def test_a_file_that_is_not_there_is_what_its_form_is_made_of(tmp_path, capsys):
+def test_a_file_that_is_not_there_is_what_its_form_is_made_of(tmp_path, refused_line):
     for form, kind in (("coco", "dataset"), ("nxtomo", "acquisition"), ("tiff", "dataset or acquisition")):
-        assert main(["export", str(tmp_path / "none.h5"), "--to", form, "-o", str(tmp_path / "out")]) == 2
-        assert f"none.h5; expected an existing {kind} file" in capsys.readouterr().err
+        assert f"none.h5; expected an existing {kind} file" in refused_line(
+            "export", tmp_path / "none.h5", "--to", form, "-o", tmp_path / "out"
+        )
 
 
 # Our HDF5 files in viewers

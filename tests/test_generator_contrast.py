@@ -251,9 +251,8 @@ def test_few_photons_and_a_thin_product_are_said():
     assert predict_contrast(LINE, low=LOW, high=HIGH, **SLABS).warnings == ()
 
 
-def test_the_command_answers_what_the_function_says(capsys):
-    assert main(["contrast", *WORDS, "--object-pixels", "30", "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+def test_the_command_answers_what_the_function_says(capsys, json_of):
+    answer = json_of("contrast", *WORDS, "--object-pixels", "30")
     found = predict_contrast(LINE, low=LOW, high=HIGH, object_pixels=30, **SLABS)
     assert answer["delta_R"] == found.delta_R.as_dict()
     assert answer["cnr_object"] == found.cnr_object
@@ -274,10 +273,9 @@ def test_the_command_maps_and_draws(capsys, tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_command_takes_a_twin(capsys, tmp_path):
+def test_the_command_takes_a_twin(json_of, tmp_path):
     write_twin(tmp_path / "twin.h5", hand_made_twin())
-    assert main(["contrast", *WORDS, "--twin", str(tmp_path / "twin.h5"), "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+    answer = json_of("contrast", *WORDS, "--twin", tmp_path / "twin.h5")
     assert answer["delta_R"]["low"] < answer["delta_R"]["value"] < answer["delta_R"]["high"]
     assert main(["contrast", *WORDS, "--twin", str(tmp_path / "twin.h5"), "--swank", "0.8"]) == 2
 
@@ -296,9 +294,8 @@ def test_the_command_takes_a_twin(capsys, tmp_path):
         (["--twin", "nowhere.h5"], "an existing file"),
     ],
 )
-def test_the_command_refuses_in_one_line(capsys, words, message):
-    assert main(["contrast", *WORDS, *words]) == 2
-    error = capsys.readouterr().err
+def test_the_command_refuses_in_one_line(refused_line, words, message):
+    error = refused_line("contrast", *WORDS, *words)
     assert message in error
     assert error.count("\n") == 1
 

@@ -205,9 +205,8 @@ def session_with(path, twin, effects, settings):
 
 
 def test_validate_finds_a_line_with_effects_inside_the_intervals_of_the_twin_that_has_them(
-    make_model_twin, tmp_path, capsys
+    make_model_twin, tmp_path, json_of
 ):
-    import json
 
     twin = make_model_twin((32, 32), source_object_mm=990.0)
     effects = (
@@ -220,8 +219,7 @@ def test_validate_finds_a_line_with_effects_inside_the_intervals_of_the_twin_tha
     write_twin(tmp_path / "after.h5", replace(twin, effects=effects))
     found = {}
     for name in ("before", "after"):
-        assert main(["validate", str(tmp_path / f"{name}.h5"), str(path), "--json"]) == 0
-        found[name] = json.loads(capsys.readouterr().out)
+        found[name] = json_of("validate", tmp_path / f"{name}.h5", path)
     assert all(row["inside"]["mean"] for row in found["after"]["rows"])
     assert found["after"]["median_abs_error_percent"]["sd"] < 1.5
     assert found["before"]["median_abs_error_percent"]["mean"] > 2.0

@@ -37,16 +37,6 @@ def image(seed=0, dtype=np.uint16, shape=SHAPE):
     return np.random.default_rng(seed).integers(0, 4000, shape).astype(dtype)
 
 
-def refused(capsys, *words, out):
-    """The line that a command prints when it refuses its input; nothing is left behind."""
-    before = sorted(out.parent.iterdir())
-    assert main(["import", *map(str, words), "-o", str(out)]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == "" and captured.err.count("\n") == 1
-    assert sorted(out.parent.iterdir()) == before and not out.exists()
-    return captured.err
-
-
 # Folders of images
 
 
@@ -257,20 +247,20 @@ def test_eight_bit_grey_and_grey_stored_as_colour_are_grey(tmp_path):
         (lambda root: (root / "dark/tail.tif").write_bytes(b""), "tail.tif: got 0 bytes that cannot be decoded"),
     ],
 )
-def test_a_folder_that_cannot_be_read_says_what_to_change(folder, tmp_path, capsys, change, message):
+def test_a_folder_that_cannot_be_read_says_what_to_change(folder, tmp_path, refused_import, change, message):
     change(folder)
-    assert message in refused(capsys, "images", folder, out=tmp_path / "out.h5")
+    assert message in refused_import("images", folder, out=tmp_path / "out.h5")
 
 
-def test_an_empty_folder_and_no_folder_are_told_apart(tmp_path, capsys):
+def test_an_empty_folder_and_no_folder_are_told_apart(tmp_path, refused_import):
     (tmp_path / "empty").mkdir()
     for layout in ("images", "reference", "zenodo"):
-        line = refused(capsys, layout, tmp_path / "empty", out=tmp_path / "o.h5")
+        line = refused_import(layout, tmp_path / "empty", out=tmp_path / "o.h5")
         assert "got an empty folder" in line
-        line = refused(capsys, layout, tmp_path / "absent", out=tmp_path / "o.h5")
+        line = refused_import(layout, tmp_path / "absent", out=tmp_path / "o.h5")
         assert "got no such folder" in line
-    assert "without EMVA1288_Data.txt" in refused(capsys, "emva1288", tmp_path / "empty", out=tmp_path / "o.h5")
-    assert "0 NeXus files" in refused(capsys, "nxtomo", tmp_path / "empty", out=tmp_path / "o.h5")
+    assert "without EMVA1288_Data.txt" in refused_import("emva1288", tmp_path / "empty", out=tmp_path / "o.h5")
+    assert "0 NeXus files" in refused_import("nxtomo", tmp_path / "empty", out=tmp_path / "o.h5")
 
 
 # NXtomo
@@ -333,29 +323,29 @@ def test_a_change_of_exposure_time_starts_a_new_series(tmp_path):
         assert [(series.n_frames, series.exposure_ms) for series in acquisition.series] == [(1, 10), (2, 20), (1, 20)]
 
 
-def test_a_nexus_file_without_what_is_needed_says_what(tmp_path, capsys):
+def test_a_nexus_file_without_what_is_needed_says_what(tmp_path, refused_import):
     out = tmp_path / "o.h5"
     with h5py.File(tmp_path / "a.nxs", "w") as file:
         file["entry/data"] = 1
-    assert "got no image_key" in refused(capsys, "nxtomo", tmp_path / "a.nxs", out=out)
+    assert "got no image_key" in refused_import("nxtomo", tmp_path / "a.nxs", out=out)
     nexus(tmp_path / "b.nxs", [1, 2], data=False)
-    assert "got no frames" in refused(capsys, "nxtomo", tmp_path / "b.nxs", out=out)
+    assert "got no frames" in refused_import("nxtomo", tmp_path / "b.nxs", out=out)
     nexus(tmp_path / "c.nxs", [1, 2, 0])
     with h5py.File(tmp_path / "c.nxs", "a") as file:
         del file["entry1/tomo_entry/instrument/detector/image_key"]
         file["entry1/tomo_entry/instrument/detector/image_key"] = [1, 2]
-    assert "2 image_key values for 3 frames" in refused(capsys, "nxtomo", tmp_path / "c.nxs", out=out)
+    assert "2 image_key values for 3 frames" in refused_import("nxtomo", tmp_path / "c.nxs", out=out)
     words = ("nxtomo", tmp_path / "c.nxs", "--detector", "other")
-    assert "detector: got 'other'" in refused(capsys, *words, out=out)
+    assert "detector: got 'other'" in refused_import(*words, out=out)
     nexus(tmp_path / "d.nxs", [1, 2, 0])
     with h5py.File(tmp_path / "d.nxs", "a") as file:
         other = file.create_group("entry1/tomo_entry/instrument/camera")
         other["image_key"], other["data"] = [1, 2], np.ones((2, *SHAPE), np.uint16)
-    assert "frames of several detectors" in refused(capsys, "nxtomo", tmp_path / "d.nxs", out=out)
+    assert "frames of several detectors" in refused_import("nxtomo", tmp_path / "d.nxs", out=out)
     assert import_nxtomo(tmp_path / "d.nxs", out, detector="camera").frames == 2
     out.unlink()
     (tmp_path / "e.nxs").write_bytes((tmp_path / "c.nxs").read_bytes()[:900])
-    assert "truncated" in refused(capsys, "nxtomo", tmp_path / "e.nxs", out=out)
+    assert "truncated" in refused_import("nxtomo", tmp_path / "e.nxs", out=out)
 
 
 def test_no_exposure_time_is_said_and_not_guessed(tmp_path):
@@ -392,10 +382,9 @@ def emva(tmp_path):
     return root
 
 
-def test_levels_of_an_emva_set_become_series_with_exposure_and_photons(emva, tmp_path, capsys):
+def test_levels_of_an_emva_set_become_series_with_exposure_and_photons(emva, tmp_path, json_of):
     out = tmp_path / "o.h5"
-    assert main(["import", "emva1288", str(emva), "-o", str(out), "--json"]) == 0
-    account = json.loads(capsys.readouterr().out)
+    account = json_of("import", "emva1288", emva, "-o", out)
     assert account["skipped"] == [{"what": "bright level of 1.18 ms", "reason": "it lists no images"}]
     with open_acquisition(out) as acquisition:
         bright, dark = acquisition.series
@@ -419,9 +408,9 @@ def test_levels_of_an_emva_set_become_series_with_exposure_and_photons(emva, tmp
         (LIST, "v 3.0\n", "got no level with images"),
     ],
 )
-def test_a_list_that_cannot_be_read_names_its_line(emva, tmp_path, capsys, old, new, message):
+def test_a_list_that_cannot_be_read_names_its_line(emva, tmp_path, refused_import, old, new, message):
     (emva / "EMVA1288_Data.txt").write_text(LIST.replace(old, new))
-    assert message in refused(capsys, "emva1288", emva, out=tmp_path / "o.h5")
+    assert message in refused_import("emva1288", emva, out=tmp_path / "o.h5")
 
 
 def test_lines_that_mean_nothing_are_reported_and_values_beyond_the_bits_are_noted(emva, tmp_path, capsys):
@@ -492,11 +481,10 @@ def processed(root, *, sets=("Dataset #1",), exposures=("100ms_10avg",), splits=
                                 writer.writerows(rows)
 
 
-def test_processed_images_become_pairs_with_masks_and_rows(tmp_path, capsys):
+def test_processed_images_become_pairs_with_masks_and_rows(tmp_path, json_of):
     processed(tmp_path / "Submission")
     out = tmp_path / "set1.h5"
-    assert main(["import", "zenodo", str(tmp_path), "-o", str(out), "--json"]) == 0
-    account = json.loads(capsys.readouterr().out)
+    account = json_of("import", "zenodo", tmp_path, "-o", out)
     assert account["format"] == "dataset" and account["frames"] == 12 and account["skipped"] == []
     assert sum(entry["images"] for entry in account["read"]) == 12
     with read_dataset(out) as dataset:
@@ -560,21 +548,21 @@ def test_without_table_the_contrast_comes_from_the_image(tmp_path):
         assert dataset.rows[number].contrast == pytest.approx(delta_r(low, high, masks[1]))
 
 
-def test_damaged_images_and_masks_of_another_shape_are_named(tmp_path, capsys):
+def test_damaged_images_and_masks_of_another_shape_are_named(tmp_path, refused_import):
     processed(tmp_path / "in", splits=("test",))
     base = tmp_path / "in/Dataset #1/40kV_40W_100ms_10avg/test"
     mask = base / "NoBone_segm/001.tiff"
     tifffile.imwrite(mask, np.zeros((2, 3, 3), np.uint8), photometric="minisblack")
-    line = refused(capsys, "zenodo", tmp_path / "in", out=tmp_path / "o.h5")
+    line = refused_import("zenodo", tmp_path / "in", out=tmp_path / "o.h5")
     assert "001.tiff: got masks of shape (2, 3, 3); expected (2, 12, 17)" in line
     (base / "NoBone/001.tiff").write_bytes((base / "NoBone/001.tiff").read_bytes()[:300])
-    line = refused(capsys, "zenodo", tmp_path / "in", out=tmp_path / "o.h5")
+    line = refused_import("zenodo", tmp_path / "in", out=tmp_path / "o.h5")
     assert "001.tiff: got 300 bytes that cannot be decoded" in line
     tifffile.imwrite(base / "NoBone/001.tiff", np.full(SHAPE, np.nan, np.float32))
-    assert "a value that is not finite" in refused(capsys, "zenodo", tmp_path / "in", out=tmp_path / "o.h5")
+    assert "a value that is not finite" in refused_import("zenodo", tmp_path / "in", out=tmp_path / "o.h5")
     tifffile.imwrite(base / "NoBone/001.tiff", np.zeros((3, 3), np.float32))
-    assert "got shape (12, 17); expected shape (3, 3)" in refused(
-        capsys, "zenodo", tmp_path / "in", out=tmp_path / "o.h5"
+    assert "got shape (12, 17); expected shape (3, 3)" in refused_import(
+        "zenodo", tmp_path / "in", out=tmp_path / "o.h5"
     )
 
 
@@ -611,7 +599,7 @@ def raw_session(root, *, samples=2, exposures=("100ms_10avg", "20ms_1avg")):
             writer.writerows(table)
 
 
-def test_a_raw_session_becomes_an_acquisition_that_makes_the_dataset(tmp_path, capsys):
+def test_a_raw_session_becomes_an_acquisition_that_makes_the_dataset(tmp_path, capsys, json_of):
     raw_session(tmp_path / "session")
     out = tmp_path / "session.h5"
     assert main(["import", "zenodo", str(tmp_path / "session"), "-o", str(out)]) == 0
@@ -627,8 +615,7 @@ def test_a_raw_session_becomes_an_acquisition_that_makes_the_dataset(tmp_path, c
         np.testing.assert_array_equal(scene.foreign_object_mask, log_pair(2, bone=True)[2][1] != 0)
         assert not acquisition.scenes["001"].foreign_object_mask.any()
     words = ["--low", "kv=40,exposure_ms=20", "--high", "kv=90,exposure_ms=20"]
-    assert main(["import", "reference", str(out), "-o", str(tmp_path / "d.h5"), *words, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["frames"] == 2
+    assert json_of("import", "reference", out, "-o", tmp_path / "d.h5", *words)["frames"] == 2
     with read_dataset(tmp_path / "d.h5") as dataset:
         low, high, _ = log_pair(2, bone=True)
         np.testing.assert_allclose(dataset.images(1), [low, high], atol=4e-4)
@@ -657,7 +644,7 @@ def test_samples_without_folder_row_or_mask_are_reported(tmp_path):
     assert not (tmp_path / "p.h5").exists()
 
 
-def test_calibration_flats_keep_their_powers_and_the_darks_before_and_after(tmp_path, capsys):
+def test_calibration_flats_keep_their_powers_and_the_darks_before_and_after(tmp_path, capsys, refused_import):
     root = tmp_path / "flats"
     for power in (1, 3, 10):
         (root / f"{power}W").mkdir(parents=True)
@@ -677,7 +664,7 @@ def test_calibration_flats_keep_their_powers_and_the_darks_before_and_after(tmp_
         assert acquisition.of_kind("flat")[0].n_frames == 3
     report = import_zenodo(root, out)
     assert any("give them with --kv and --exposure-ms" in note for note in report.notes)
-    line = refused(capsys, "zenodo", root, "--kv", "-90", out=tmp_path / "p.h5")
+    line = refused_import("zenodo", root, "--kv", "-90", out=tmp_path / "p.h5")
     assert "--kv: got -90.0 kV" in line
 
 
@@ -714,10 +701,9 @@ def pairs(tmp_path):
     return root
 
 
-def test_corrected_pairs_with_masks_become_a_dataset(pairs, tmp_path, capsys):
+def test_corrected_pairs_with_masks_become_a_dataset(pairs, tmp_path, json_of):
     out = tmp_path / "d.h5"
-    assert main(["import", "reference", str(pairs), "-o", str(out), "--json"]) == 0
-    account = json.loads(capsys.readouterr().out)
+    account = json_of("import", "reference", pairs, "-o", out)
     assert account["read"][0]["images"] == 3 and account["read"][0]["with_foreign_object"] == 2
     with read_dataset(out) as dataset:
         assert [row.image for row in dataset.rows] == ["p1", "p2", "p3"]
@@ -767,19 +753,19 @@ def test_incomplete_pairs_are_skipped_and_products_dealt_out(pairs, tmp_path):
         ("product_mask", "products_mask", "did you mean product_mask"),
     ],
 )
-def test_a_sidecar_of_pairs_that_cannot_be_used_says_why(pairs, tmp_path, capsys, old, new, message):
+def test_a_sidecar_of_pairs_that_cannot_be_used_says_why(pairs, tmp_path, refused_import, old, new, message):
     (pairs / "raytwin.toml").write_text(PAIRS.replace(old, new))
-    assert message in refused(capsys, "reference", pairs, out=tmp_path / "d.h5")
+    assert message in refused_import("reference", pairs, out=tmp_path / "d.h5")
 
 
-def test_a_ring_narrower_than_a_pixel_is_refused(pairs, tmp_path, capsys):
-    line = refused(capsys, "reference", pairs, "--ring-px", "0", out=tmp_path / "d.h5")
+def test_a_ring_narrower_than_a_pixel_is_refused(pairs, tmp_path, refused_import):
+    line = refused_import("reference", pairs, "--ring-px", "0", out=tmp_path / "d.h5")
     assert "dilations: got 0; expected 1 pixel or more" in line
 
 
-def test_masks_of_another_shape_are_refused(pairs, tmp_path, capsys):
+def test_masks_of_another_shape_are_refused(pairs, tmp_path, refused_import):
     imageio.imwrite(pairs / "p2/bone.png", np.zeros((3, 3), np.uint8))
-    line = refused(capsys, "reference", pairs, out=tmp_path / "d.h5")
+    line = refused_import("reference", pairs, out=tmp_path / "d.h5")
     assert "bone.png: got a mask of 3 x 3 pixels; expected 12 x 17 as the images" in line
 
 
@@ -804,13 +790,13 @@ def test_raw_series_with_a_sidecar_become_a_dataset_directly(tmp_path):
         np.testing.assert_allclose(dataset.images(0), [low, high], atol=4e-4)
 
 
-def test_an_acquisition_without_pairs_makes_no_dataset(tmp_path, capsys):
+def test_an_acquisition_without_pairs_makes_no_dataset(tmp_path, refused_import):
     with write_acquisition(tmp_path / "a.h5", Instrument()) as writer:
         writer.add_series("flat", kind="flat", frames=image()[None])
-    line = refused(capsys, "reference", tmp_path / "a.h5", out=tmp_path / "d.h5")
+    line = refused_import("reference", tmp_path / "a.h5", out=tmp_path / "d.h5")
     assert "expected object series at two tube voltages that name the same scene" in line
     (tmp_path / "cut.h5").write_bytes((tmp_path / "a.h5").read_bytes()[:2000])
-    assert "truncated" in refused(capsys, "reference", tmp_path / "cut.h5", out=tmp_path / "d.h5")
+    assert "truncated" in refused_import("reference", tmp_path / "cut.h5", out=tmp_path / "d.h5")
 
 
 @pytest.mark.parametrize("layout", ["images", "dicom", "xtekct", "nxtomo", "emva1288", "zenodo", "reference"])
@@ -821,11 +807,10 @@ def test_every_layout_has_a_help_with_an_example(layout, capsys):
     assert f"raytwin import {layout}" in capsys.readouterr().out
 
 
-def test_an_output_that_cannot_be_written_is_one_line(emva, tmp_path, capsys):
+def test_an_output_that_cannot_be_written_is_one_line(emva, tmp_path, refused_line):
     (tmp_path / "file").write_text("")
     for out, told in ((tmp_path, "got a folder"), (tmp_path / "file" / "o.h5", "got a place that cannot be written")):
-        assert main(["import", "emva1288", str(emva), "-o", str(out)]) == 2
-        line = capsys.readouterr().err
+        line = refused_line("import", "emva1288", emva, "-o", out)
         assert told in line and line.count("\n") == 1
 
 
@@ -839,10 +824,9 @@ def test_bad_pixels_of_a_twin_are_replaced_in_every_image(pairs, tmp_path):
         assert (dataset.images(1) != images).any()
 
 
-def test_the_name_of_a_shipped_twin_gives_its_bad_pixels(pairs, tmp_path, capsys):
+def test_the_name_of_a_shipped_twin_gives_its_bad_pixels(pairs, tmp_path, refused_line):
     words = ["import", "reference", str(pairs), "-o", str(tmp_path / "d.h5"), "--twin", "virtual_lab"]
-    assert main(words) == 2
-    assert "bad-pixel mask: got shape (64, 64); expected shape (12, 17)" in capsys.readouterr().err
+    assert "bad-pixel mask: got shape (64, 64); expected shape (12, 17)" in refused_line(*words)
 
 
 def test_the_sidecars_of_the_manual_are_read(folder, pairs, tmp_path):
@@ -880,7 +864,7 @@ i d1_2.png
 
 
 @pytest.mark.parametrize(("bits", "gain_DN", "first_photons"), [(8, 0.05, 0.0), (12, 0.4, 50.0)])
-def test_emva_sets_with_an_exposure_of_0_import_and_calibrate(tmp_path, capsys, bits, gain_DN, first_photons):
+def test_emva_sets_with_an_exposure_of_0_import_and_calibrate(tmp_path, json_of, bits, gain_DN, first_photons):
     """The dark end of a set with pulsed light, or a camera whose shortest exposure is not told, has 0 ns."""
     rng = np.random.default_rng(bits)
     root = tmp_path / "set"
@@ -904,14 +888,12 @@ def test_emva_sets_with_an_exposure_of_0_import_and_calibrate(tmp_path, capsys, 
             write(f"d{number}_{frame}", 0.0)
     text = EMVA_LIST.format(bits=bits, first=first_photons, levels="\n".join(lines))
     (root / "EMVA1288_Data.txt").write_text(text)
-    assert main(["import", "emva1288", str(root), "-o", str(tmp_path / "o.h5"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["frames"] == 14
-    assert main(["calibrate", str(tmp_path / "o.h5"), "-o", str(tmp_path / "twin.h5"), "--json"]) == 0
-    (level,) = json.loads(capsys.readouterr().out)["levels"]
+    assert json_of("import", "emva1288", root, "-o", tmp_path / "o.h5")["frames"] == 14
+    (level,) = json_of("calibrate", tmp_path / "o.h5", "-o", tmp_path / "twin.h5")["levels"]
     assert level["gain_DN_low"] < gain_DN < level["gain_DN_high"]
 
 
-def test_a_photon_counter_without_darks_has_a_dark_of_0_by_declaration(tmp_path, capsys):
+def test_a_photon_counter_without_darks_has_a_dark_of_0_by_declaration(tmp_path, capsys, json_of):
     rng = np.random.default_rng(4)
     folder = tmp_path / "counter"
     folder.mkdir()
@@ -923,8 +905,7 @@ def test_a_photon_counter_without_darks_has_a_dark_of_0_by_declaration(tmp_path,
     (folder / "raytwin.toml").write_text(sidecar)
     assert main(["import", "images", str(folder), "-o", str(tmp_path / "o.h5")]) == 0
     capsys.readouterr()
-    assert main(["calibrate", str(tmp_path / "o.h5"), "-o", str(tmp_path / "twin.h5"), "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+    answer = json_of("calibrate", tmp_path / "o.h5", "-o", tmp_path / "twin.h5")
     assert answer["dark_DN"]["value"] == 0.0
     assert answer["levels"][0]["gain_DN"] == pytest.approx(1.0, rel=0.05)
 

@@ -1,6 +1,5 @@
 """Images whose headers say how they were taken: DICOM, EDF, HIS, Nikon scans, OME-TIFF; written here to the published layouts."""
 
-import json
 import struct
 
 import numpy as np
@@ -11,7 +10,6 @@ from raytwin.acquisition import Filter, open_acquisition
 from raytwin.acquisition._image_files import iter_images, read_image
 from raytwin.acquisition.image_header import read_image_header
 from raytwin.acquisition.import_any import layout_of
-from raytwin.cli import main
 from raytwin.errors import FileFormatError
 
 SHAPE = (12, 17)
@@ -19,21 +17,6 @@ SHAPE = (12, 17)
 
 def picture(seed=0, *, shape=SHAPE, dtype=np.uint16):
     return np.random.default_rng(seed).integers(0, 4000, shape).astype(dtype)
-
-
-def imported(capsys, *words, out):
-    assert main(["import", *map(str, words), "-o", str(out), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def refused(capsys, *words, out):
-    """The line that a command prints when it refuses its input; nothing is left behind."""
-    before = sorted(out.parent.iterdir())
-    assert main(["import", *map(str, words), "-o", str(out)]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == "" and captured.err.count("\n") == 1, captured.err
-    assert sorted(out.parent.iterdir()) == before and not out.exists()
-    return captured.err
 
 
 # DICOM and DICONDE
@@ -113,8 +96,8 @@ def radiographs(tmp_path):
     return root
 
 
-def test_dicom_series_take_setting_and_instrument_from_their_tags(radiographs, tmp_path, capsys):
-    account = imported(capsys, "dicom", radiographs, out=tmp_path / "s.h5")
+def test_dicom_series_take_setting_and_instrument_from_their_tags(radiographs, tmp_path, json_of):
+    account = json_of("import", "dicom", radiographs, "-o", tmp_path / "s.h5")
     assert account["frames"] == 9 and layout_of(radiographs) == "dicom"
     with open_acquisition(tmp_path / "s.h5") as session:
         dark, flat, high, part = session.series
@@ -169,29 +152,29 @@ def test_exposure_follows_from_tube_load_and_what_is_unclear_is_told(tmp_path):
     ]
 
 
-def test_dicom_files_that_cannot_be_used_are_one_line(tmp_path, capsys):
+def test_dicom_files_that_cannot_be_used_are_one_line(tmp_path, refused_import):
     whole = write_dicom(tmp_path / "whole" / "a.dcm", picture()).read_bytes()
     write_dicom(tmp_path / "log" / "a.dcm", picture(), PixelIntensityRelationship="LOG")
     for name, data in (("cut", whole[:-60]), ("tags", whole[:300]), ("text", b"no DICOM at all")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "a.dcm").write_bytes(data)
-        assert "a.dcm" in refused(capsys, "dicom", tmp_path / name, out=tmp_path / "o.h5")
-    assert "Relationship LOG; expected LIN" in refused(capsys, "dicom", tmp_path / "log", out=tmp_path / "o.h5")
+        assert "a.dcm" in refused_import("dicom", tmp_path / name, out=tmp_path / "o.h5")
+    assert "Relationship LOG; expected LIN" in refused_import("dicom", tmp_path / "log", out=tmp_path / "o.h5")
     (tmp_path / "none").mkdir()
     (tmp_path / "none" / "a.txt").write_text("")
-    assert "none of them DICOM" in refused(capsys, "dicom", tmp_path / "none", out=tmp_path / "o.h5")
+    assert "none of them DICOM" in refused_import("dicom", tmp_path / "none", out=tmp_path / "o.h5")
 
 
-def test_a_sidecar_goes_before_the_tags_and_one_series_holds_one_setting(tmp_path, capsys):
+def test_a_sidecar_goes_before_the_tags_and_one_series_holds_one_setting(tmp_path, refused_import, json_of):
     folder = tmp_path / "session"
     for number, kV in enumerate(("40", "90")):
         write_dicom(folder / f"f{number}.dcm", picture(number), **{**TAGS, "KVP": kV})
     sidecar = '[instrument]\npixel_mm = 0.2\n[[series]]\nkind = "flat"\nfiles = "*.dcm"\n'
     (folder / "raytwin.toml").write_text(sidecar)
-    line = refused(capsys, "images", folder, out=tmp_path / "o.h5")
+    line = refused_import("images", folder, out=tmp_path / "o.h5")
     assert "40.0 and 90.0 in the headers" in line and "split the series" in line
     (folder / "raytwin.toml").write_text(sidecar + "kV = 60\n")
-    account = imported(capsys, "images", folder, out=tmp_path / "o.h5")
+    account = json_of("import", "images", folder, "-o", tmp_path / "o.h5")
     with open_acquisition(tmp_path / "o.h5") as session:
         (flat,) = session.series
         assert (flat.kV, flat.current_mA, flat.exposure_ms) == (60, 1, 20)
@@ -202,7 +185,7 @@ def test_a_sidecar_goes_before_the_tags_and_one_series_holds_one_setting(tmp_pat
 # EDF and other formats of fabio
 
 
-def test_edf_and_cbf_come_in_with_their_exposure(tmp_path, capsys):
+def test_edf_and_cbf_come_in_with_their_exposure(tmp_path, refused_import, json_of):
     pytest.importorskip("fabio", reason="EDF files need the extra `fabio`")
     from fabio.cbfimage import CbfImage
     from fabio.edfimage import EdfImage
@@ -218,7 +201,7 @@ def test_edf_and_cbf_come_in_with_their_exposure(tmp_path, capsys):
     )
     sidecar = '[[series]]\nkind = "flat"\nfiles = "*.edf"\n[[series]]\nkind = "object"\nfiles = "*.cbf"\n'
     (folder / "raytwin.toml").write_text(sidecar)
-    account = imported(capsys, "images", folder, out=tmp_path / "o.h5")
+    account = json_of("import", "images", folder, "-o", tmp_path / "o.h5")
     with open_acquisition(tmp_path / "o.h5") as session:
         flat, sample = session.series
         np.testing.assert_array_equal(flat.read_frames(), [picture(1), picture(2)])
@@ -228,10 +211,10 @@ def test_edf_and_cbf_come_in_with_their_exposure(tmp_path, capsys):
     assert any("pixel_mm" in note and "neither is taken" in note for note in account["notes"])
     whole = (folder / "flat.edf").read_bytes()
     (folder / "flat.edf").write_bytes(whole[: len(whole) - 300])
-    assert "flat.edf" in refused(capsys, "images", folder, out=tmp_path / "p.h5")
+    assert "flat.edf" in refused_import("images", folder, out=tmp_path / "p.h5")
     (folder / "flat.edf").write_bytes(whole)
     (folder / "sample.cbf").write_bytes((folder / "sample.cbf").read_bytes()[:250])
-    assert "no binary section" in refused(capsys, "images", folder, out=tmp_path / "p.h5")
+    assert "no binary section" in refused_import("images", folder, out=tmp_path / "p.h5")
 
 
 # HIS of Varex panels
@@ -262,7 +245,7 @@ def his(frames, *, number_type=4, correction=0, time_us=66500.0, kind=0x7000):
     return head + bytes(32) + data
 
 
-def test_his_files_give_frames_frame_time_and_corrections(tmp_path, capsys):
+def test_his_files_give_frames_frame_time_and_corrections(tmp_path, json_of):
     frames = np.stack([picture(1), picture(2)])
     folder = tmp_path / "panel"
     folder.mkdir()
@@ -270,7 +253,7 @@ def test_his_files_give_frames_frame_time_and_corrections(tmp_path, capsys):
     (folder / "object.his").write_bytes(his(frames * 0.5, number_type=128, correction=3))
     text = '[[series]]\nkind = "flat"\nfiles = "flat.his"\nkV = 40\n[[series]]\nkind = "object"\nfiles = "object.his"\n'
     (folder / "raytwin.toml").write_text(text)
-    imported(capsys, "images", folder, out=tmp_path / "o.h5")
+    json_of("import", "images", folder, "-o", tmp_path / "o.h5")
     with open_acquisition(tmp_path / "o.h5") as session:
         flat, seen = session.series
         np.testing.assert_array_equal(flat.read_frames(), frames)
@@ -324,8 +307,8 @@ def scan(tmp_path):
     return folder
 
 
-def test_a_nikon_scan_becomes_a_series_of_corrected_projections(scan, tmp_path, capsys):
-    account = imported(capsys, "xtekct", scan, "--exposure-ms", "500", out=tmp_path / "o.h5")
+def test_a_nikon_scan_becomes_a_series_of_corrected_projections(scan, tmp_path, json_of):
+    account = json_of("import", "xtekct", scan, "--exposure-ms", "500", "-o", tmp_path / "o.h5")
     assert account["skipped"] == [] and layout_of(scan) == "xtekct"
     with open_acquisition(tmp_path / "o.h5") as session:
         (series,) = session.series
@@ -335,24 +318,24 @@ def test_a_nikon_scan_becomes_a_series_of_corrected_projections(scan, tmp_path, 
         assert series.corrected == {"offset", "gain"} and series.scene == "jar_scan"
         assert (session.instrument.pixel_mm, session.instrument.source_detector_mm) == (0.2, 735.7075)
     (scan / "jar scan_0002.tif").unlink()
-    account = imported(capsys, "xtekct", scan, out=tmp_path / "o.h5")
+    account = json_of("import", "xtekct", scan, "-o", tmp_path / "o.h5")
     assert "3 projections announced, 2 found" in account["skipped"][0]["reason"]
     assert any("--exposure-ms" in note for note in account["notes"])
 
 
-def test_a_nikon_scan_that_cannot_be_used_is_one_line(scan, tmp_path, capsys):
+def test_a_nikon_scan_that_cannot_be_used_is_one_line(scan, tmp_path, refused_import):
     for path in scan.glob("*.tif"):
         path.unlink()
-    assert "no files jar scan_0001.tif" in refused(capsys, "xtekct", scan, out=tmp_path / "o.h5")
+    assert "no files jar scan_0001.tif" in refused_import("xtekct", scan, out=tmp_path / "o.h5")
     for text, told in (("[Other]\na=1\n", "[XTekCT] among them"), ("no section", "a text of another form")):
         (scan / "jar scan.xtekct").write_text(text)
-        assert told in refused(capsys, "xtekct", scan, out=tmp_path / "o.h5")
+        assert told in refused_import("xtekct", scan, out=tmp_path / "o.h5")
 
 
 # TIFF with a scale
 
 
-def test_the_pixel_size_of_ome_and_imagej_files_is_read_and_print_resolutions_are_not(tmp_path, capsys):
+def test_the_pixel_size_of_ome_and_imagej_files_is_read_and_print_resolutions_are_not(tmp_path, json_of):
     folder = tmp_path / "pictures"
     folder.mkdir()
     metadata = {"axes": "YX", "PhysicalSizeX": 0.15, "PhysicalSizeXUnit": "mm"}
@@ -366,6 +349,6 @@ def test_the_pixel_size_of_ome_and_imagej_files_is_read_and_print_resolutions_ar
         assert read_image_header(folder / name).pixel_mm == pytest.approx(0.15, rel=1e-6), name
     assert read_image_header(folder / "print.tif").pixel_mm is None
     (folder / "raytwin.toml").write_text('[[series]]\nkind = "flat"\nfiles = "*.tif"\n')
-    imported(capsys, "images", folder, out=tmp_path / "o.h5")
+    json_of("import", "images", folder, "-o", tmp_path / "o.h5")
     with open_acquisition(tmp_path / "o.h5") as session:
         assert session.instrument.pixel_mm == pytest.approx(0.15)

@@ -171,14 +171,13 @@ def test_the_command_plants_effects_and_names_them_in_the_truth(tmp_path, capsys
         (["--protocol", "set1", "--source-detector-mm", "-4"], "--source-detector-mm: got -4 mm"),
     ],
 )
-def test_bad_input_is_one_clear_line_and_leaves_nothing(words, line, tmp_path, capsys):
-    assert main(["lab", "-o", str(tmp_path / "s.h5"), *words]) == 2
-    told = capsys.readouterr().err.strip().splitlines()
-    assert len(told) == 1 and line in told[0]
+def test_bad_input_is_one_clear_line_and_leaves_nothing(words, line, tmp_path, refused_line):
+    assert line in refused_line("lab", "-o", tmp_path / "s.h5", *words)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_output_that_cannot_be_written_is_bad_input(tmp_path, capsys):
+def test_an_output_that_cannot_be_written_is_bad_input(tmp_path, refused_line):
     (tmp_path / "file").write_text("")
-    assert main(["lab", "-o", str(tmp_path / "file" / "s.h5"), "--protocol", "set1", "--products", "2"]) == 2
-    assert "expected a file in a folder of yours" in capsys.readouterr().err
+    assert "expected a file in a folder of yours" in refused_line(
+        "lab", "-o", tmp_path / "file" / "s.h5", "--protocol", "set1", "--products", "2"
+    )

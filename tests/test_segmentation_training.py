@@ -656,15 +656,13 @@ def test_examples_of_a_dataset_are_those_of_its_arrays(dataset_file):
 # Commands
 
 
-def test_train_and_detect_from_the_command_line(dataset_file, tmp_path, capsys):
+def test_train_and_detect_from_the_command_line(dataset_file, tmp_path, json_of):
     words = ["train", str(dataset_file), "-o", str(tmp_path / "r"), "--networks", "2", "--seed", "3", "--epochs", "1"]
-    assert main([*words, "--batch", "2", "--device", "cpu", "--threads", "1", "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = json_of(*words, "--batch", "2", "--device", "cpu", "--threads", "1")
     assert [network["network"] for network in result["networks"]] == [0, 1]
     assert all(network["best_epoch"] == 1 and len(network["losses"]) == 1 for network in result["networks"])
     hits = tmp_path / "hits.csv"
-    assert main(["detect", str(tmp_path / "r"), str(dataset_file), "-o", str(hits), "--device", "cpu", "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = json_of("detect", tmp_path / "r", dataset_file, "-o", hits, "--device", "cpu")
     assert result["networks"] == [0, 1]
     assert set(result["false_alarm_rate"]) == {"value", "low", "high", "n"}
     assert (result["hit_rate"]["n"], result["false_alarm_rate"]["n"]) == (2, 2)
@@ -738,11 +736,12 @@ def test_bad_input_is_one_line_exit_2_and_leaves_no_file(words, message, trained
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_without_finished_networks_cannot_detect(trained, dataset_file, tmp_path, capsys):
+def test_a_folder_without_finished_networks_cannot_detect(trained, dataset_file, tmp_path, refused_line):
     (tmp_path / "r").mkdir()
     (tmp_path / "r" / "run.json").write_text((trained[0] / "run.json").read_text())
-    assert main(["detect", str(tmp_path / "r"), str(dataset_file), "-o", str(tmp_path / "h.csv")]) == 2
-    assert "got finished networks none; expected at least one; run the same" in capsys.readouterr().err
+    assert "got finished networks none; expected at least one; run the same" in refused_line(
+        "detect", tmp_path / "r", dataset_file, "-o", tmp_path / "h.csv"
+    )
     assert not (tmp_path / "h.csv").exists()
 
 

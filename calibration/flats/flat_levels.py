@@ -14,6 +14,7 @@ from ...generator.line.twin import Estimate, Level, estimate_from_sd
 from ..frames._kept_sums import KeptSums
 from ..frames.dark_frames import DarkFrames, shrinkage
 from ..frames.frame_sums import effective_frames
+from ..frames.robust import robust_sd
 from .noise_of_flats import FlatNoise
 from .repeated_frames import beam_of
 
@@ -212,7 +213,7 @@ def _rate(
     frames = np.array([point.frames * point.averaged for point in known], dtype=np.float64)
     of_a_pixel = (noise + np.array([p.pair_variance_DN2 for p in known])) / frames
     # robust: a few pixels far off do not move a median
-    spread = 1.4826 * float(np.median(np.abs(flat_shape[good] - np.median(flat_shape[good]))))
+    spread = robust_sd(flat_shape[good])
     sampling = median_variance(of_a_pixel, spread_sd=spread * signal, pixels=int(good.sum())) / load**2
     weight = 1.0 / (sampling + (_SERIES_REPRODUCIBILITY * signal / load) ** 2)
     weight /= weight.sum()

@@ -16,6 +16,7 @@ from ...acquisition.acquisition_io import AcquisitionFile, Series
 from ...acquisition.setting import text_from_filters
 from ..frames._kept_sums import KeptSums
 from ..frames.frame_sums import effective_frames
+from ..frames.robust import robust_sd
 from ..spread.noise_power import NoisePower, holds_squares
 from ..spread.spread_fit import SpreadFit
 
@@ -191,7 +192,7 @@ def most_read_variance(darks: Sequence[tuple[NDArray[np.float64], int]], good: N
             steps = (difference[:, 1:] - difference[:, :-1])[pair]
             if steps.size:
                 # pixels whose dark grows unlike their neighbours' are cut off
-                spread = (1.4826 * float(np.median(np.abs(steps - np.median(steps))))) ** 2
+                spread = robust_sd(steps) ** 2
                 found.append(0.5 * spread / (1.0 / first_count + 1.0 / second_count))
     return _MARGIN * min(found) if found else None
 

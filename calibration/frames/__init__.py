@@ -10,5 +10,6 @@ Files:
     full_scale           series that reach the end of the ADC's range
     frame_checks         copies of frames, change of scene
     code_steps           distance of the ADC's codes
+    robust               standard deviation by most values
     frame_memory         noise that frames take over from those before them
 """

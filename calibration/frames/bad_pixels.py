@@ -11,6 +11,7 @@ from ...generator.line.twin import BAD_PIXEL_CODES
 from ._kept_sums import KeptSums
 from .code_steps import least_change
 from .dark_frames import DarkFrames
+from .robust import robust_sd
 
 _DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot
 _DEAD = 0.5  # share of its neighbours' response below which a pixel is dead
@@ -139,7 +140,7 @@ def _bad_neighbours(bad: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 def _robust_spread(values: NDArray[np.float64]) -> tuple[float, float]:
     centre = float(np.median(values))
-    return centre, 1.4826 * float(np.median(np.abs(values - centre)))
+    return centre, robust_sd(values, about=centre)
 
 
 def cluster_evidence(bad: NDArray[np.uint8]) -> dict[str, int]:

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .robust import robust_sd
+
 FALSE_ALARM = 1e-3  # probability that a series without fault is reported, per check
 # What a panel and a tube that work may do between frames of one series, relative to the signal. Level and smooth shape:
 # three times the largest plausible rms of output drift and of a smooth gain change (3 %). Pattern: what the flats of a
@@ -322,7 +324,7 @@ def _change(
         gram = rows_in_use.T @ rows_in_use
         solution = np.linalg.lstsq(gram, rows_in_use.T @ target[use], rcond=1e-11)[0] / scale
         left = target - matrix @ solution
-        spread = 1.4826 * float(np.median(np.abs(left[use & alive])))
+        spread = robust_sd(left[use & alive], about=0.0)
         use = np.abs(left) <= max(5.0 * spread, 1e-12)
         if np.count_nonzero(use & alive) < 2 * len(design):
             break
@@ -333,7 +335,7 @@ def _change(
         surface = np.tensordot(solution[:count], terms, 1)
         smooth = surface * middle + solution[count]
         # what noise alone gives to the coefficients, so that only more than that is a change
-        spread = 1.4826 * float(np.median(np.abs(left.reshape(-1)[alive]))) * noise_growth / math.sqrt(left.size)
+        spread = robust_sd(left.reshape(-1)[alive], about=0.0) * noise_growth / math.sqrt(left.size)
         by_noise = spread**2 * float(chdtri(len(design), FALSE_ALARM))
         shape = math.sqrt(max(float(np.var(smooth - level * middle)) - by_noise, 0.0)) / signal
         level = math.copysign(max(abs(level) - _two_sided_limit(FALSE_ALARM) * spread / signal, 0.0), level)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...acquisition.instrument import Instrument
 from ...acquisition.setting import Filter
 from ...generator.line.spectral_signal import OpenBeam, SpectralModel
-from ...generator.line.twin import Level, NoiseModel
+from ...generator.line.twin import Z95, Level, NoiseModel
 from ...generator.line.twin_spectrum import slope_over_gain
 from .dose_data import (
     DOSIMETER_CALIBRATION,
@@ -22,7 +22,6 @@ from .dose_data import (
 )
 from .priors import DARK_CURRENT, GAIN_DISCREPANCY, LEVEL_DISCREPANCY
 
-_Z95 = 1.959964
 _THICKER = 0.01  # relative, of the derivative by a wedge's thickness
 WEDGE = "wedge_log_thickness:"  # names of parameters that scale the thicknesses of wedges
 # kind of a datum -> whose learned size is its own departure from the model; the sizes' medians
@@ -189,4 +188,4 @@ def repeated_levels(repeats: Sequence[Mapping[str, Any]]) -> list[tuple[NDArray[
 
 def relative_sd(estimate: object) -> float:
     value, low, high = estimate.value, estimate.low, estimate.high  # type: ignore[attr-defined]
-    return float((high - low) / (2 * _Z95) / max(abs(value), 1e-300))
+    return float((high - low) / (2 * Z95) / max(abs(value), 1e-300))

@@ -21,7 +21,7 @@ from ...generator.line.spectral_signal import (
     SpectrumCorrection,
     attenuation_scale_name,
 )
-from ...generator.line.twin import Level, NoiseModel, SpectralPosterior
+from ...generator.line.twin import Z95, Level, NoiseModel, SpectralPosterior
 from ...generator.line.twin_spectrum import secondary_of_levels
 from ...spectra import Spectrum
 from .dose_data import DOSE_FILTRATION, KermaRatio, KermaReading, absorber_priors, dose_parameters
@@ -51,7 +51,6 @@ from .spectral_posterior import SHAPE_PARAMETERS, Posterior, Sampled
 
 _SAYS_NOTHING = 30.0  # sd of the logarithm of a datum that is left out
 _MOST_ROUNDS = 6  # of fits to data that contradict the model, their errors larger each time
-_Z95 = 1.959964
 _OUTPUT = "log_output"
 _WEDGE_DEPARTS = 2.5  # standard deviations: one wedge in 80 departs so far
 # standard deviations of the prior from which on the output is looked at, and of prior and data from which on it is not believed:
@@ -389,7 +388,7 @@ def _sd_of_mixture(sizes: NDArray[np.float64]) -> float:
     low, high = float(sizes.min()), float(sizes.max())
     for _ in range(60):
         middle = 0.5 * (low + high)
-        if np.mean(ndtr(-_Z95 * middle / sizes)) > 0.025:
+        if np.mean(ndtr(-Z95 * middle / sizes)) > 0.025:
             low = middle
         else:
             high = middle

@@ -22,6 +22,7 @@ from ...generator.line.spectral_signal import (
     SpectralModel,
     absorber_of_parameter,
 )
+from ...generator.line.twin import Z95
 from .dose_data import DOSIMETER_HARDNESS
 from .posterior_draws import climbed, draw, resampled
 from .priors import (
@@ -35,7 +36,6 @@ from .priors import (
 )
 from .spectral_data import DISCREPANCIES, DISCREPANCY_OF, OF_DETECTOR, Datum
 
-_Z95 = 1.959964
 _KEPT = 512
 _FARTHEST = 6.0  # prior standard deviations at which derivatives are taken: Gaussian, one parameter in 5e8 lies beyond
 _WIDEST_SIZE = 4.0  # prior standard deviations of the logarithm of a discrepancy's size
@@ -228,7 +228,7 @@ class Posterior:
     @property
     def _largest_variances(self) -> NDArray[np.float64]:
         """Variance of each datum's logarithm (datum,) with the largest plausible discrepancy."""
-        return np.asarray(self.variances(np.full((1, self.dimensions), _Z95))[0])
+        return np.asarray(self.variances(np.full((1, self.dimensions), Z95))[0])
 
     def chi_square(self, parameters: NDArray[np.float64]) -> float:
         """Squared misfit over noise and the largest plausible discrepancy, at one parameter set (parameter,)."""

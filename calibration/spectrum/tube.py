@@ -16,6 +16,7 @@ from ...generator.line.spectral_signal import OpenBeam, absorber_of_parameter
 from ...generator.line.twin import SpectralPosterior
 from ...generator.line.twin_spectrum import model_of_posterior
 from ...generator.predictions.tube_twin import NO_DETECTOR, NO_OUTPUT, TubeTwin
+from ..frames.robust import robust_sd
 from .dose_data import DOSE_FILTRATION, DOSIMETER_CALIBRATION, DOSIMETER_HARDNESS, KermaRatio, KermaReading
 from .output_table import OutputTable
 from .spectral_fit import SpectralFit, contradicts, fit_evidence, fit_spectrum, unlike_output
@@ -267,7 +268,7 @@ def _farthest(posterior: SpectralPosterior, data: DoseData, *, level_free: bool)
             continue
         own = np.array([item.relative_sd for item in items])
         size = np.abs(departure - (float(np.median(departure)) if level_free else 0.0))
-        size = size / np.hypot(_scatter(departure), own) / -float(ndtri(0.5 * _RARE / len(items)))
+        size = size / np.hypot(robust_sd(departure), own) / -float(ndtri(0.5 * _RARE / len(items)))
         place = int(np.argmax(size))
         if size[place] > worst[0]:
             worst = (float(size[place]), [items[place]])
@@ -291,15 +292,10 @@ def _stray(posterior: SpectralPosterior, others: DoseData, suspect: KermaReading
     else:
         around = departures(posterior, (), others.ratios)[1]
         departure, freedom = float(departures(posterior, (), [suspect])[1][0]), math.inf
-    common, own = _scatter(around) ** 2, suspect.relative_sd**2
+    common, own = robust_sd(around) ** 2, suspect.relative_sd**2
     together = (common + own) ** 2 / (common**2 / (_EFFICIENCY * (around.size - 1)) + own**2 / freedom)
     limit = -float(stdtrit(together, 0.5 * _STRAYS / (around.size + 1)))
     return departure if abs(departure) > limit * math.sqrt(common + own) else None
-
-
-def _scatter(departure: NDArray[np.float64]) -> float:
-    """Standard deviation of departures (n,) by their median absolute deviation."""
-    return 1.4826 * float(np.median(np.abs(departure - np.median(departure))))
 
 
 def _rows(items: Sequence[KermaReading | KermaRatio], departure: NDArray[np.float64]) -> list[dict[str, Any]]:

@@ -79,7 +79,7 @@ def with_decimal_points(
     for at, name in enumerate(header):
         written: dict[str, str] = {}
         for row, new, line in zip(rows, changed, lines, strict=False):
-            if at < len(row) and "." in new[at] and _is_number(new[at]):
+            if at < len(row) and "." in new[at] and is_number(new[at]):
                 written.setdefault("comma" if new[at] != row[at] else "point", f"{row[at].strip()!r} in line {line}")
         if len(written) > 1:
             raise FileFormatError(
@@ -92,10 +92,11 @@ def with_decimal_points(
 
 def _with_decimal_point(cell: str) -> str:
     changed = cell.replace(",", ".")
-    return changed if cell.count(",") == 1 and _is_number(changed) else cell
+    return changed if cell.count(",") == 1 and is_number(changed) else cell
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Whether a text is a number, as `float` reads it."""
     try:
         float(text)
     except ValueError:

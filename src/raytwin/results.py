@@ -183,6 +183,11 @@ def number_text(value: float | None, digits: int = 4) -> str:
     return "not known" if value is None else f"{value:.{digits}g}"
 
 
+def percent_text(share: float | None) -> str:
+    """A share in whole per cent for people; None: of nothing."""
+    return "none to judge by" if share is None else f"{100 * share:.0f} %"
+
+
 def between_text(low: str | None, high: str | None) -> str:
     """The ends of an interval for people, each already in words; None: an end that the data do not give."""
     if low is None:

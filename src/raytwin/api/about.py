@@ -61,8 +61,12 @@ _LIBRARIES = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
 class Info(Result):
-    """The installation: version, python, extras (name -> installed), libraries (name -> version, None: absent), cache (folder, and
-    its size in bytes), devices that networks can train on, shipped calibrations."""
+    """The installation.
+
+    Fields: version (of raytwin); python (its version); extras (name -> installed); libraries (name -> version, None: absent);
+    cache (folder of spectra), cache_bytes (its size); devices (that networks can train on); processors (number of cores);
+    calibrations (names of shipped twins).
+    """
 
     version: str
     python: str
@@ -97,7 +101,10 @@ class Info(Result):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
 class Exported(Result):
-    """Files that were written for another program: its name, folder, files (name -> what it holds), warnings."""
+    """Files that were written for another program.
+
+    Fields: to (the form, such as `coco`); folder; files (name -> what it holds); warnings.
+    """
 
     to: str
     folder: Path

@@ -146,7 +146,10 @@ _DECISION_FIELDS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
 class Sweep(Result):
-    """A campaign that was worked through: its folder and its answer (rows, recommendation and what it rests on)."""
+    """A campaign that was worked through.
+
+    Fields: path (its folder); answer (rows, recommendation and what it rests on, as `raytwin sweep --json` prints them).
+    """
 
     path: Path
     answer: Mapping[str, Any]

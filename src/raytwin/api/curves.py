@@ -37,7 +37,8 @@ class PodCurve(Result):
 
     Fields: fit; table (what was read); more (beyond the curve, by name: `alternatives`, `over_links`, `false_alarms`,
     `lapse`, `bootstrap`, `covariates`, `explanation`, `as_published`, `roc`); warnings; response_label (the response's
-    column, None for hits) with its censoring limits; link_named: whether the link was asked for, and not the default one.
+    column, None for hits); left_censored, right_censored (limits beyond which responses are only known to lie, in the
+    response's unit, None: none); link_named (whether the link was asked for, and not the default one).
     """
 
     fit: "PodFit | ResponseFit"
@@ -71,7 +72,7 @@ class PodCurve(Result):
         return found
 
     def to_dataframe(self, *, points: int = 101) -> "pandas.DataFrame":
-        """The curve over the tested sizes: the size's column, pod, low, high (two-sided 95 %, each size for itself).
+        """The curve at so many `points` over the tested sizes: size, pod, low, high (two-sided 95 %, each size for itself).
 
         Raises:
             FitError: there is no curve, or it is that of a response.
@@ -104,7 +105,7 @@ class PodCurve(Result):
         return axes
 
     def save_table(self, path: str | os.PathLike[str]) -> None:
-        """Write the curve with its 95 % band as comma-separated values.
+        """Write the curve with its 95 % band to the file `path`, as comma-separated values.
 
         Raises:
             FitError: there is no curve, or it is that of a response.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ..errors import FileFormatError, InputError, check_whole
 from ..files import check_new_folder, check_not_read, given_path
-from ..results import Result, Table, axes_or_new, counted, frame, plain
+from ..results import Result, Table, axes_or_new, counted, frame, percent_text, plain
 from ._given import PathLike, as_twin, dataset_of, twin_sha256, whole_seed
 from ._progress import Progress, Telling
 
@@ -44,7 +44,7 @@ class GeneratedPairs(Result):
 
     Fields: summary; path (of the dataset file, None in memory); rows (one a pair); images (n, 2, row, column), -log(I / I0),
     low kV first; counts (the same in DN, None where left out); foreign_object_masks, product_masks (n, row, column); these
-    are None where a file was asked for; attributes (provenance); tiff (folder and trees written, None: none).
+    are None where a file was asked for; attributes (provenance); tiff (folder and trees written, None: none); warnings.
     """
 
     summary: "GenerationSummary"
@@ -132,7 +132,11 @@ class GeneratedPairs(Result):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
 class TrainedNetworks(Result):
-    """Networks of a folder: path, recipe, device, a record of each network, and what the user should know."""
+    """Networks of a folder.
+
+    Fields: path (the folder); recipe (how they are built and trained); device (that trained them); networks (a record of each, with
+    the losses of its epochs); warnings.
+    """
 
     path: Path
     recipe: "Recipe"
@@ -177,8 +181,8 @@ class TrainedNetworks(Result):
                 str(item.network),
                 f"{item.best_epoch} of {len(item.history)}",
                 f"{item.best_validation_loss:.3f}",
-                _percent(item.best.validation_hit_rate),
-                _percent(item.best.validation_false_alarm_rate),
+                percent_text(item.best.validation_hit_rate),
+                percent_text(item.best.validation_false_alarm_rate),
             )
             for item in self.networks
         )
@@ -248,10 +252,6 @@ class Detections(Result):
         return Table(title=title, header=("", "value", "95 % interval", "trials"), rows=rows, notes=notes)
 
 
-def _percent(value: float | None) -> str:
-    return "none to judge by" if value is None else f"{100 * value:.0f} %"
-
-
 def _rate_cells(rate: "Rate") -> tuple[str, str, str]:
     if rate.value is None or rate.low is None or rate.high is None:
         return "no trials", "", "0"
@@ -277,6 +277,13 @@ def _network_answer(result: "NetworkResult") -> dict[str, Any]:
 
 def read_dataset(path: PathLike) -> "Dataset":
     """A dataset file, open for reading; use it in a `with` block. Images stay in the file until they are read.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        Rows (one a pair), and methods that read images (n, 2, row, column), -log(I / I0) with the low kV first, and masks
+        (n, row, column) by their numbers.
 
     Raises:
         FileFormatError: no such file, not a dataset, damaged; the message says where.

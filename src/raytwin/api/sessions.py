@@ -36,7 +36,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
 class LabSession(Result):
-    """A session measured in the virtual lab: path of the acquisition file, of the truth beside it, and the truth."""
+    """A session measured in the virtual lab.
+
+    Fields: path (of the acquisition file); truth_path (of the truth, JSON beside it); shape (rows, columns) of the detector;
+    truth (the system, its effects, and what is expected of each series).
+    """
 
     path: Path
     truth_path: Path
@@ -53,7 +57,7 @@ class LabSession(Result):
         return frame([{"series": name, **dict(series)} for name, series in self.truth["series"].items()])
 
     def plot(self, ax: Any = None, *, series: str | None = None) -> Any:
-        """Mean frame of a series, DN (None: the first flat, else the first series); returns the axes.
+        """Mean frame of a series, DN; series: its name (None: the first flat, else the first series); returns the axes.
 
         Raises:
             InputError: no such series.

@@ -43,6 +43,12 @@ def read_twin(twin: "Twin | TubeTwin | PathLike") -> "Twin | TubeTwin":
 def open_acquisition(path: PathLike) -> "AcquisitionFile":
     """An acquisition file, open for reading; use it in a `with` block. Frames stay in the file until they are read.
 
+    Args:
+        path: of the file.
+
+    Returns:
+        Instrument, scenes and series; each series has its setting, and methods that read its frames (frame, row, column), DN.
+
     Raises:
         FileFormatError: no such file, not an acquisition, damaged; the message says where.
 

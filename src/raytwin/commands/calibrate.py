@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
     spectra = {}
     for text in arguments.spectrum:
         file, colon, voltage = text.rpartition(":")
-        if not colon or not _is_number(voltage):
+        if not colon or not _is_above_zero(voltage):
             raise InputError(
                 "--spectrum", received=repr(text), expected="FILE:kV", remedy="for example tube_60kV.csv:60"
             )
@@ -142,7 +142,7 @@ def _instrument(arguments: argparse.Namespace) -> "Instrument | None":
     return Instrument(anode=options["anode"], anode_angle_deg=options["angle"], inherent_filtration=inherent)
 
 
-def _is_number(text: str) -> bool:
+def _is_above_zero(text: str) -> bool:
     try:
         return float(text) > 0
     except ValueError:

@@ -11,7 +11,7 @@ sees the same noise twice.
 import argparse
 from typing import TYPE_CHECKING
 
-from ..results import counted
+from ..results import counted, percent_text
 from ._answer import answer, say
 
 if TYPE_CHECKING:
@@ -131,12 +131,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _line(result: "NetworkResult") -> str:
-    def percent(value: float | None) -> str:
-        return "none to judge by" if value is None else f"{100 * value:.0f} %"
-
     return (
         f"network {result.network}: best epoch {result.best_epoch} of {len(result.history)},"
         f" validation loss {result.best_validation_loss:.3f},"
-        f" objects detected {percent(result.best.validation_hit_rate)},"
-        f" false alarms {percent(result.best.validation_false_alarm_rate)}"
+        f" objects detected {percent_text(result.best.validation_hit_rate)},"
+        f" false alarms {percent_text(result.best.validation_false_alarm_rate)}"
     )

@@ -5,6 +5,7 @@ from typing import Any
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.pairs import object_pairs
+from ..acquisition.scenes import Scene
 from ..acquisition.setting import text_from_filters
 from ..errors import InputError
 from ..results import counted
@@ -12,7 +13,7 @@ from .check_result import Allowed, SeriesRow
 from .findings import Finding, FindingCode
 
 DARK_LEVEL, READ_NOISE, LEVEL, NOISE, SPECTRUM = "dark level", "read noise", "level", "gain and blur", "spectrum"
-LAG, IMAGES, VALIDATION = "lag", "reference images", "validation"
+LAG, IMAGES, VALIDATION, ATTENUATION = "lag", "reference images", "validation", "attenuation and scatter"
 # what can be learnt from series that serve for it
 OF_DARKS, OF_READ_NOISE, OF_NOISE = "dark level", "read noise", "gain, blur and photons a pixel"
 OF_LOADS, OF_BEAMS, OF_OUTPUT = "linearity", "spectrum: other kV and filters", "output of the tube, dose"
@@ -55,9 +56,14 @@ def _setting_text(item: Series) -> str:
 
 
 def series_row(
-    item: Series, findings: Sequence[Finding], *, level_DN: float | None, noise_DN: float | None
+    item: Series,
+    findings: Sequence[Finding],
+    *,
+    scene: Scene | None,
+    level_DN: float | None,
+    noise_DN: float | None,
 ) -> SeriesRow:
-    """One series in the table of a check; level_DN: None: it was not read."""
+    """One series in the table of a check; scene: that it shows, None: none is described; level_DN: None: it was not read."""
     codes = {entry.code for entry in findings if item.name in entry.names}
     return SeriesRow(
         name=item.name,
@@ -68,11 +74,11 @@ def series_row(
         shape=item.shape,
         level_DN=level_DN,
         noise_DN=noise_DN,
-        serves_for=() if level_DN is None else _serves(item, codes),
+        serves_for=() if level_DN is None else _serves(item, codes, scene),
     )
 
 
-def _serves(item: Series, codes: set[FindingCode]) -> tuple[str, ...]:
+def _serves(item: Series, codes: set[FindingCode], scene: Scene | None) -> tuple[str, ...]:
     """What a series is good for, as it stands."""
     if codes & (UNFIT - {FindingCode.SCENE_CHANGES}):
         return ()
@@ -94,7 +100,10 @@ def _serves(item: Series, codes: set[FindingCode]) -> tuple[str, ...]:
         if item.role == "evaluation":
             serves = [VALIDATION] if serves else []
     elif item.kind == "object":
-        serves.append(IMAGES)
+        if _is_product(scene):
+            serves.append(IMAGES)
+        if scene is not None and scene.thickness_mm:
+            serves.append(ATTENUATION)
     elif item.kind == "afterglow":
         serves.append(LAG)
     return tuple(serves)
@@ -203,29 +212,29 @@ def _validation(series: _Serving) -> Allowed:
 
 
 def _attenuation(series: _Serving) -> Allowed:
-    objects = series.acquisition.of_kind("object")
-    known = _names([item.name for item in objects if _has_thickness(series.acquisition, item)])
-    return Allowed(what="attenuation and scatter", possible=bool(known), why=known or "no object of known thickness")
+    known = series.names(ATTENUATION)
+    return Allowed(what=ATTENUATION, possible=bool(known), why=known or "no object of known thickness")
 
 
 def _reference_images(series: _Serving) -> Allowed:
+    scenes = series.acquisition.scenes
     try:
-        pairs = len(object_pairs(series.acquisition))
+        pairs = sum(_is_product(scenes.get(pair.scene)) for pair in object_pairs(series.acquisition))
     except InputError:
         pairs = 0
-    why = counted(pairs, "pair") if pairs else "no object measured at two tube voltages with a `scene`"
+    why = counted(pairs, "pair") if pairs else "no product measured at two tube voltages with a `scene`"
     return Allowed(what="reference images for two energies", possible=bool(pairs), why=why)
+
+
+def _is_product(scene: Scene | None) -> bool:
+    """Whether images of a scene are those of a product: it is described as one, or as nothing."""
+    return scene is None or scene.kind in ("", "product")
 
 
 def _lag(series: _Serving) -> Allowed:
     afterglow = series.names(LAG)
     why = afterglow or "no afterglow series (beam off straight after exposure)"
     return Allowed(what="lag", possible=bool(afterglow), why=why)
-
-
-def _has_thickness(acquisition: AcquisitionFile, item: Series) -> bool:
-    scene = acquisition.scenes.get(item.scene)
-    return scene is not None and len(scene.thickness_mm) > 0
 
 
 def _grouped(flats: Sequence[Series]) -> list[list[Series]]:

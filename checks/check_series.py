@@ -95,6 +95,7 @@ def check_series(acquisition: AcquisitionFile, *, progress: Progress | None = No
         series_row(
             item,
             findings,
+            scene=acquisition.scenes.get(item.scene),
             level_DN=scans[item.name].level_DN if item.name in scans else None,
             noise_DN=scans[item.name].noise_DN if item.name in scans and scans[item.name].noise_DN >= 0 else None,
         )

@@ -15,7 +15,8 @@ import pytest
 import tifffile
 
 from raytwin import calibrate
-from raytwin.acquisition import open_acquisition
+from raytwin.acquisition import open_acquisition, write_acquisition
+from raytwin.acquisition.instrument import Instrument
 from raytwin.checks import frame_signs
 from raytwin.checks.check import check_acquisition
 from raytwin.checks.check_series import _lifted_by_light
@@ -80,6 +81,32 @@ def test_a_good_session_is_not_suspected_and_its_series_serve(session):
     assert {"spectrum: other kV and filters", "output of the tube, dose"} <= possible
     assert "lag" not in possible
     assert len(repr(result).splitlines()) <= 20
+
+
+def test_products_are_reference_images_and_test_objects_of_known_thickness_are_not(tmp_path):
+    path, rng = tmp_path / "objects.h5", np.random.default_rng(5)
+    with write_acquisition(path, Instrument()) as writer:
+        writer.add_scene("wedge", kind="wedge", thickness_mm={"Al": np.full((24, 24), 2.0)})
+        writer.add_scene("fish", kind="product")
+        for scene in ("wedge", "fish"):
+            for kV in (40.0, 90.0):
+                frames = rng.normal(3000.0 + kV, 20.0, (3, 24, 24)).astype(np.uint16)
+                writer.add_series(
+                    f"{scene}_{kV:g}",
+                    kind="object",
+                    frames=frames,
+                    kV=kV,
+                    current_mA=1.0,
+                    exposure_ms=20.0,
+                    scene=scene,
+                )
+    result = check_acquisition(path)
+    served = {row.name: row.serves_for for row in result.series}
+    assert served["wedge_40"] == ("attenuation and scatter",)
+    assert served["fish_40"] == ("reference images",)
+    allowed = {item.what: item for item in result.allows}
+    assert allowed["reference images for two energies"].why == "1 pair"
+    assert allowed["attenuation and scatter"].why == "wedge_40, wedge_90"
 
 
 @pytest.fixture

@@ -81,7 +81,7 @@ def judge_session(
         rng = np.random.default_rng(_SEED)
         if features_only:
             prepared = prepare_session(acquisition, twin=None, rng=rng)
-            problem = problem_of(prepared, prepared.twin)
+            problem = problem_of(prepared)
         else:
             found = diagnose(acquisition, rng=rng, without=without)
             problem = found.compared
@@ -93,7 +93,7 @@ def judge_session(
             if without and not features_only:
                 # what was withheld must have a response too, to say afterwards how far it lay from all the others
                 prepared = prepare_session(acquisition, twin=replace(found.twin, effects=()), rng=rng)
-                problem = problem_of(prepared, prepared.twin)
+                problem = problem_of(prepared)
             result["features"] = session_features(problem)
             write_statistics(statistics_path, session_statistics(problem))
             if second is not None and not features_only:

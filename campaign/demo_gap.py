@@ -124,7 +124,7 @@ def compare_products(acquisition: Path, *, before: Twin, after: Twin, seed: int)
         views = []
         for twin in (before, after):
             ready = prepare_session(session, twin=twin, rng=np.random.default_rng(seed))
-            problem = problem_of(ready, ready.twin, variants=())
+            problem = problem_of(ready, variants=())
             views.append({view.session.name: view for view in problem.views})
         found = []
         for name, plain in views[0].items():

@@ -13,8 +13,6 @@ from ..generator.line.twin import Twin
 from .judgement.answer import Diagnosis, in_pixels
 from .judgement.judgement import judge
 from .problem.assemble import problem_of
-from .session.binning import lost_by_binning
-from .session.inapplicable import inapplicable
 from .session.preparation import calibrated_twin, findings_left, mislabelled, prepare_session
 
 
@@ -56,11 +54,9 @@ def _diagnosed(
     wrong: tuple[Finding, ...] = ()
     while True:
         session = prepare_session(acquisition, twin=twin, rng=rng, contradicted=wrong, progress=progress)
-        unseen = lost_by_binning() if session.factor > 1 else {}
         left = session.findings
         try:
-            passed_over = (*without, *unseen, *inapplicable(session.twin.instrument))
-            problem = problem_of(session, session.twin, without=passed_over, progress=progress)
+            problem = problem_of(session, without=(*without, *session.out_of_question), progress=progress)
             result = judge(problem, session.twin, rng=rng, progress=progress)
         except InputError as error:
             if not left and session.contradicted:

@@ -526,6 +526,7 @@ class Bare(SimpleNamespace):
     given = ()
     residual_without = Problem.residual_without
     left_by = Problem.left_by
+    with_chance = Problem.with_chance
 
 
 def second_day_problem(rng, *, series=24, each=40, factors=3):

@@ -101,7 +101,6 @@ def test_dust_on_a_flat_is_left_out_and_makes_no_bad_pixel():
         gain_quantum=0.0,
         gain_white=0.0,
         good=ALL,
-        frames={},
     )
     expected = {"flat": SimpleNamespace(signal_DN=np.full(SHAPE, signal))}
     found = new_outliers([item], expected, looks, maps)

@@ -205,7 +205,6 @@ def test_pixels_that_stand_out_before_every_object_are_the_panels_own(divided):
         gain_quantum=0.0,
         gain_white=0.0,
         good=ALL,
-        frames={},
     )
     assert [tuple(place) for place in np.argwhere(new_outliers(kept, expected, looks, maps).bad)] == [dead, hot]
     # three products are too few to tell a defect from what they have in common
@@ -232,7 +231,6 @@ def test_noise_that_a_line_has_in_common_makes_no_pixel_of_it_stand_out():
         gain_quantum=0.0,
         gain_white=0.0,
         good=ALL,
-        frames={},
     )
     assert np.median(pairs[44]) > 8.0 * np.median(pairs)
     assert [tuple(place) for place in np.argwhere(new_outliers([item], {}, looks, maps).bad)] == [noisy]

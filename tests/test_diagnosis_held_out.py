@@ -19,6 +19,7 @@ class Bare(SimpleNamespace):
     given = ()
     residual_without = Problem.residual_without
     left_by = Problem.left_by
+    with_chance = Problem.with_chance
 
 
 def problem(*rows, calibrating=0):

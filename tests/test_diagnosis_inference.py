@@ -82,6 +82,7 @@ class Bare(SimpleNamespace):
     given = ()
     residual_without = Problem.residual_without
     left_by = Problem.left_by
+    with_chance = Problem.with_chance
 
 
 @pytest.fixture

@@ -158,9 +158,9 @@ def test_a_residual_knows_what_the_base_had(line):
     problem.residual_without = lambda effects: Problem.residual_without(problem, effects)
     np.testing.assert_allclose(Problem.residual_without(problem, ["tail"]), line.noise)
     np.testing.assert_allclose(Problem.residual_without(problem, ["motion"]), line.noise + line.motion)
-    half = {"motion": (curve("motion", line.motion), 0.5 * STRENGTH)}
+    half = [Point(curve=curve("motion", line.motion), strength=0.5 * STRENGTH, level=0.1)]
     np.testing.assert_allclose(Problem.left_by(problem, half), line.noise + 0.5 * line.motion)
-    other = {"tail": (curve("tail", line.tail), STRENGTH)}
+    other = [Point(curve=curve("tail", line.tail), strength=STRENGTH, level=0.1)]
     np.testing.assert_allclose(
         Problem.left_by(problem, other, without=["motion"]), line.noise + line.motion - line.tail
     )

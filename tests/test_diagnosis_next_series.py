@@ -15,6 +15,7 @@ from raytwin.diagnosis.advice.next_series import (
 )
 from raytwin.diagnosis.advice.plan import advice_text
 from raytwin.diagnosis.diagnose_session import diagnose
+from raytwin.diagnosis.inference.observed import Point
 from raytwin.diagnosis.model.changes import catalogue_variants
 from raytwin.diagnosis.problem.assemble import build_problem
 from raytwin.diagnosis.session.preparation import prepare_session
@@ -45,7 +46,7 @@ def problem(session):
 
 def at_strength(problem, effect):
     curve = next(item for item in problem.curves if item.effect == effect)
-    return {effect: (curve, STRENGTHS[effect])}
+    return [Point(curve=curve, strength=STRENGTHS[effect], level=0.0)]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,7 @@ def diagnosis(session):
 
 def explanation(diagnosis, *effects):
     found = next(item for item in diagnosis.hypotheses if set(item.effects) == set(effects))
-    return {effect: (found.variants[effect], found.strengths[effect][0]) for effect in effects}
+    return [found.point(effect) for effect in effects]
 
 
 @pytest.mark.slow
@@ -103,7 +104,7 @@ def test_beam_off_frames_are_asked_for_where_lag_ties_with_a_drifting_dark(probl
 
 def test_an_explanation_lies_nowhere_from_itself_at_another_strength(problem):
     first = at_strength(problem, "focal_spot")
-    same = {effect: (curve, 1.0000001 * strength) for effect, (curve, strength) in first.items()}
+    same = [replace(point, strength=1.0000001 * point.strength) for point in first]
     assert _separation(problem, None, np.zeros(0, dtype=np.intp), first, same) < 1e-3
 
 

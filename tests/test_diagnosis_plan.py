@@ -11,7 +11,7 @@ from raytwin.diagnosis.advice.plan import Proposal, advice_text, best_repeat, di
 from raytwin.diagnosis.inference.curve_fits import fit_effects
 from raytwin.diagnosis.inference.inference import weigh_hypotheses
 from raytwin.diagnosis.inference.nuisances import Nuisances
-from raytwin.diagnosis.inference.observed import Observed
+from raytwin.diagnosis.inference.observed import Observed, Point
 from raytwin.diagnosis.inference.refine import refine
 from raytwin.diagnosis.inference.seen import Blocks
 from raytwin.diagnosis.inference.unknown import Families
@@ -107,18 +107,19 @@ def test_a_nuisance_along_an_effect_takes_its_separation():
 
 def test_the_series_that_holds_the_difference_is_the_one_to_repeat():
     first, second = curve("glare", axis(0, 25)), curve("scatter", axis(0))
-    found = best_repeat(problem([first, second]), {"glare": (first, 10.0)}, {"scatter": (second, 10.0)})
+    one, other = ([Point(curve=own, strength=10.0, level=0.0)] for own in (first, second))
+    found = best_repeat(problem([first, second]), one, other)
     assert found is not None
     assert found.series == "series 1"
     assert found.separation == pytest.approx(10.0)
     # four times the frames halve a standard deviation that is all counting noise
     assert found.separation_then == pytest.approx(20.0)
-    stiff = best_repeat(problem([first, second], noise=0.0), {"glare": (first, 10.0)}, {"scatter": (second, 10.0)})
+    stiff = best_repeat(problem([first, second], noise=0.0), one, other)
     assert stiff is not None
     assert stiff.separation_then == pytest.approx(stiff.separation)
     # however far they are apart already: that has not told one from the other
     assert found.settles and not stiff.settles
-    assert best_repeat(problem([first]), {"glare": (first, 10.0)}, {"glare": (first, 10.0)}) is None
+    assert best_repeat(problem([first]), one, one) is None
 
 
 def test_nodes_are_joined_by_cubics():

@@ -223,9 +223,9 @@ def test_a_displaced_scene_is_compared_where_its_picture_covers_the_panel():
 
 def test_strengths_of_variants_lie_one_after_the_other():
     variants = catalogue_variants()
-    rows = [row for rows in strength_rows(variants) for row in rows]
-    assert rows == list(range(sum(len(variant.strengths) for variant in variants)))
-    assert [len(rows) for rows in strength_rows(variants)] == [len(variant.strengths) for variant in variants]
+    every = [(variant, strength) for variant in variants for strength in variant.strengths]
+    for variant, rows in zip(variants, strength_rows(variants), strict=True):
+        assert every[rows] == [(variant, strength) for strength in variant.strengths]
 
 
 def request(kind, *, after=True, previous=()):

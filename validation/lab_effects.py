@@ -50,7 +50,7 @@ def session_row(path: Path, request: EffectRequest) -> dict:
     """What a session says of the effect that was planted in it."""
     with open_acquisition(path) as acquisition:
         session = prepare_session(acquisition, twin=None, rng=np.random.default_rng(0))
-        row, weighed = row_of(problem_of(session, session.twin), request.id)
+        row, weighed = row_of(problem_of(session), request.id)
     leading = verdict_of(weighed.hypotheses).leading
     row |= {"strength": request.strength, "since": request.since}
     if request.id in leading.variants:

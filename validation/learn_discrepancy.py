@@ -43,7 +43,7 @@ def session_row(path: Path, planted: str) -> dict:
     """Evidence of the planted effect by level, of the likest once it is left out, and what is named with and without it."""
     with open_acquisition(path) as acquisition:
         session = prepare_session(acquisition, twin=None, rng=np.random.default_rng(0))
-        row, _ = row_of(problem_of(session, session.twin), planted)
+        row, _ = row_of(problem_of(session), planted)
     return row
 
 

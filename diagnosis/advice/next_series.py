@@ -26,14 +26,14 @@ from ...generator.frames.conditions import with_conditions
 from ...generator.frames.line_model import LineModel
 from ...generator.line.series_request import SeriesRequest
 from ...generator.line.twin import Twin
+from ..inference.observed import Point
 from ..model.changes import Variant
-from ..model.curves import Curve
 from ..problem.assemble import build_problem
 from ..problem.problem import Problem
 from .plan import Proposal, length
 
 FRAMES = 20  # of each series that is planned
-Explanation = Mapping[str, tuple[Curve, float]]  # effect -> curve of the problem, strength
+Explanation = Sequence[Point]  # with curves of the problem
 
 _OPAQUE = ("W", 3.0)  # mm
 _TILT = math.radians(4.0)  # of an edge against the pixels: IEC 62220-1 has 1.5 to 3 degrees, ISO 12233 has 5
@@ -288,9 +288,8 @@ def best_measurement(
     if line is None or not planned:
         return None
     wanted = {
-        (curve.effect, curve.variant.name): _fixed(problem, curve.variant, strength)
-        for explanation in (first, second)
-        for curve, strength in explanation.values()
+        (point.effect, point.curve.variant.name): _fixed(problem, point.curve.variant, point.strength)
+        for point in (*first, *second)
     }
     try:
         with tempfile.TemporaryDirectory() as folder:
@@ -424,16 +423,16 @@ def _separation(
         rows: its probes that count.
     """
 
-    def response(curve: Curve, strength: float) -> NDArray[np.float64]:
-        own = curve.response(strength)
+    def response(point: Point) -> NDArray[np.float64]:
+        own = point.curve.response(point.strength)
         if taken is None:
             return own
-        key = curve.effect, curve.variant.name
+        key = point.effect, point.curve.variant.name
         there = next((item for item in taken.curves if (item.effect, item.variant.name) == key), None)
-        more = np.zeros(len(rows)) if there is None else there.response(strength)[rows]
+        more = np.zeros(len(rows)) if there is None else there.response(point.strength)[rows]
         return np.concatenate([own, more])
 
-    ones, others = ([response(*item) for item in explanation.values()] for explanation in (first, second))
+    ones, others = ([response(point) for point in explanation] for explanation in (first, second))
     apart = np.sum(ones, axis=0) - np.sum(others, axis=0)
     factors, blocks = problem.factors, problem.blocks
     if taken is not None:

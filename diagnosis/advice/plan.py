@@ -16,7 +16,8 @@ from ...errors import InputError
 from ...generator.effects import EFFECTS
 from ..inference.inference import title_of
 from ..inference.nuisances import Nuisances, Whitening
-from ..model.curves import Curve
+from ..inference.observed import Point
+from ..model.curves import Curve, places_of
 from ..problem.problem import Problem
 
 _GRID = 41  # strengths of a competitor, evenly in the logarithm
@@ -58,11 +59,7 @@ def distinguishability(problem: Problem) -> Distinguishability:
         )
     nodes = np.concatenate([curve.responses for curve in curves])
     gram = Nuisances(whitening.factors).inner(nodes, nodes)
-    places: list[slice] = []
-    position = 0
-    for curve in curves:
-        places.append(slice(position, position + len(curve.responses)))
-        position += len(curve.responses)
+    places = places_of([curve.responses for curve in curves])
 
     def lengths(number: int, strengths: NDArray[np.float64]) -> NDArray[np.float64]:
         weights, own = curves[number].weights(strengths), gram[places[number], places[number]]
@@ -179,20 +176,16 @@ def advice_text(proposals: Sequence[Proposal], first: Sequence[str], second: Seq
     return f"{text} Measure what isolates them: {isolating}"
 
 
-def best_repeat(
-    problem: Problem, first: Mapping[str, tuple[Curve, float]], second: Mapping[str, tuple[Curve, float]]
-) -> Proposal | None:
+def best_repeat(problem: Problem, first: Sequence[Point], second: Sequence[Point]) -> Proposal | None:
     """The series whose repetition would separate two explanations most; None where they are alike everywhere.
 
     Args:
         problem: of the session.
-        first, second: effect -> (curve of the problem, strength) of either explanation.
+        first, second: effects of either explanation, with curves of the problem.
     """
 
-    def response(explanation: Mapping[str, tuple[Curve, float]]) -> NDArray[np.float64]:
-        return sum(
-            (curve.response(strength) for curve, strength in explanation.values()), np.zeros(len(problem.residual))
-        )
+    def response(explanation: Sequence[Point]) -> NDArray[np.float64]:
+        return sum((one.curve.response(one.strength) for one in explanation), np.zeros(len(problem.residual)))
 
     apart = response(first) - response(second)
     now = length(problem.factors, problem.blocks, apart)

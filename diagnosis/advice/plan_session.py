@@ -13,8 +13,6 @@ from ...generator.effects import EFFECTS
 from ...generator.line.twin import Twin
 from ...results import Result, Table, axes_or_new, frame, plain
 from ..problem.assemble import problem_of
-from ..session.binning import lost_by_binning
-from ..session.inapplicable import inapplicable
 from ..session.preparation import prepare_session
 from .plan import Distinguishability, distinguishability
 
@@ -113,13 +111,11 @@ def plan_session(
     # thousands of small matrices: threads would wait for each other longer than they work
     with threadpool_limits(limits=1, user_api="blas"):
         session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
-        unseen = lost_by_binning() if session.factor > 1 else {}
-        passed_over = (*without, *unseen, *inapplicable(session.twin.instrument))
-        problem = problem_of(session, session.twin, without=passed_over, progress=progress)
+        problem = problem_of(session, without=(*without, *session.out_of_question), progress=progress)
         found = distinguishability(problem)
     shares = [EFFECTS[effect].strength.pixels_per_bin(session.factor) for effect in found.effects]
     return SessionPlan(
         distinguishability=replace(found, strengths=found.strengths * shares, seen_from=found.seen_from * shares),
-        cannot_be_judged={**problem.missing_effects, **unseen},
+        cannot_be_judged={**problem.missing_effects, **session.lost},
         findings=(*session.findings, *session.other_findings),
     )

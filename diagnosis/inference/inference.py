@@ -59,6 +59,21 @@ class Hypothesis:
     location: str = ""
     misfit: str = ""
 
+    @property
+    def of_catalogue(self) -> bool:
+        """Whether it has effects, all of the catalogue."""
+        return bool(self.effects) and self.effects != (UNKNOWN,)
+
+    def point(self, effect: str) -> Point:
+        """One of its effects at the strength of the best value."""
+        return Point(
+            curve=self.variants[effect], strength=self.strengths[effect][0], level=self.levels.get(effect, 0.0)
+        )
+
+    def points(self, *, but: str = "") -> list[Point]:
+        """All its effects of the catalogue at these strengths; but: less this one."""
+        return [self.point(effect) for effect in self.variants if effect != but]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Priors:
@@ -245,8 +260,8 @@ class Misfits:
 
     def ratio(self, points: Sequence[Point], found: ExtraVariance) -> float:
         """Length of a misfit over that of what the laws beside it do, those of the twin's own effects among them."""
-        named = {point.curve.effect for point in points}
-        acting = [*points, *(point for point in self._observed.given if point.curve.effect not in named)]
+        named = {point.effect for point in points}
+        acting = [*points, *(point for point in self._observed.given if point.effect not in named)]
         moved = math.hypot(*(self._observed.length(point.curve, point.strength) for point in acting))
         return found.length / max(moved, 1.0)
 
@@ -271,7 +286,7 @@ class Misfits:
 
     def in_presence_of(self, points: Sequence[Point]) -> tuple[float, ExtraVariance]:
         """Log evidence over none, without priors, of effects at their points with a misfit beside them, and what that misfit is."""
-        effects = [point.curve.effect for point in points]
+        effects = [point.effect for point in points]
         alone = beside = self._observed.conditioned(*effects)
         for point in points:
             beside = beside.in_presence_of(point)
@@ -281,13 +296,13 @@ class Misfits:
 
     def prior(self, points: Sequence[Point], *, another: bool = False) -> float:
         """Log of what effects at their points take of the prior; another: of what is only like them."""
-        alone = self._observed.conditioned(*(point.curve.effect for point in points))
+        alone = self._observed.conditioned(*(point.effect for point in points))
         total = 0.0
         for point in points:
             others = alone
             for other in points:
                 others = others if other is point else others.in_presence_of(other)
-            any_strength = another and self._any_strength(point.curve.effect)
+            any_strength = another and self._any_strength(point.effect)
             total += log_prior(others, point, another=another, any_strength=any_strength)
         return total
 

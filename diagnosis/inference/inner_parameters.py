@@ -19,7 +19,7 @@ from ..model.curves import Curve
 from .curve_fits import fit_curve, interval_of
 from .discrepancy import only
 from .inference import Hypothesis
-from .observed import Observed, Point
+from .observed import Observed
 from .search import from_middle, slopes_of
 from .seen import FitTarget, Responder, Whitener
 
@@ -38,9 +38,7 @@ def with_inner_open(
         whitener: of its responses.
     """
     seen = FitTarget(observed=replace(observed, given=()), respond=respond, whitener=whitener)
-    opened = {
-        effect: _opened(curve, hypothesis.strengths[effect][0], seen) for effect, curve in hypothesis.variants.items()
-    }
+    opened = {point.effect: _opened(point.curve, point.strength, seen) for point in hypothesis.points()}
     if all(opened[effect] is curve for effect, curve in hypothesis.variants.items()):
         return hypothesis
     strengths = dict(hypothesis.strengths)
@@ -48,8 +46,7 @@ def with_inner_open(
         beside = observed.conditioned(*hypothesis.effects)
         for other, its in opened.items():
             if other != effect:
-                strength, level = hypothesis.strengths[other][0], hypothesis.levels[other]
-                beside = beside.in_presence_of(Point(curve=its, strength=strength, level=level))
+                beside = beside.in_presence_of(replace(hypothesis.point(other), curve=its))
         fit = fit_curve(beside, curve, levels=only(hypothesis.levels[effect]))
         # the straight line says how much stays open; the strength itself is known from the law as it bends
         value, low, high = hypothesis.strengths[effect]

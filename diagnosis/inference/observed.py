@@ -32,6 +32,11 @@ class Point:
     strength_sd: float = FREE_SD
     share: float = 0.0
 
+    @property
+    def effect(self) -> str:
+        """Id of the effect."""
+        return self.curve.effect
+
 
 @dataclass(frozen=True, kw_only=True)
 class Observed:
@@ -91,7 +96,7 @@ class Observed:
         if left_out not in self._standing:
             found = replace(self, given=()) if self.given else self
             for point in self.given:
-                if point.curve.effect not in left_out:
+                if point.effect not in left_out:
                     found = found.in_presence_of(point)
             self._standing[left_out] = found
         return self._standing[left_out]
@@ -105,7 +110,7 @@ class Observed:
         return replace(self, given=tuple(replace(point, level=level) for point in self.given))
 
     def _free(self, effects: Sequence[str]) -> frozenset[str]:
-        return frozenset(point.curve.effect for point in self.given).intersection(effects)
+        return frozenset(point.effect for point in self.given).intersection(effects)
 
     def scaled(self, curve: Curve) -> Curve:
         """A curve in the units of the first probes, in these."""

@@ -89,18 +89,16 @@ def weigh_pairs(
     # each of the leading effects with its best companion: what one's law leaves is asked of all of them
     companions: dict[str, tuple[float, Point, str]] = {}
     for item in likely:
-        companions.setdefault(item[1].curve.effect, item)
+        companions.setdefault(item[1].effect, item)
     taken = likely[:_IN_FULL]
     taken += [item for item in companions.values() if not any(item is one for one in taken)]
-    starts = [(singles[point.curve.effect].best, point, other) for _, point, other in taken]
+    starts = [(singles[point.effect].best, point, other) for _, point, other in taken]
     start = _together_exactly(observed, singles)
-    if start is not None and {start[1].curve.effect, start[2]} not in [
-        {at.curve.effect, other} for _, at, other in starts
-    ]:
+    if start is not None and {start[1].effect, start[2]} not in [{at.effect, other} for _, at, other in starts]:
         starts.append(start)
     result = []
     for fit, point, other in starts:
-        first = point.curve.effect
+        first = point.effect
         both = {first: curves(first, other), other: curves(other, first)}
         result.append(_settled(observed, fit, point, both, other))
     return result
@@ -146,7 +144,7 @@ def _at_first_sight(
     observed: Observed, point: Point, others: Sequence[str], curves: Callable[[str, str], Sequence[Curve]]
 ) -> Iterator[tuple[str, float]]:
     """Every other effect with the log evidence over none of it beside a first one at its point, the priors aside."""
-    first = point.curve.effect
+    first = point.effect
     together = [[other for other in others if not observed.has(other)], *([one] for one in others if observed.has(one))]
     for effects in filter(None, together):
         start, left = _beside_first(observed, point, effects[0])
@@ -164,20 +162,20 @@ def _settled(
     start, beside = _beside_first(observed, point, other)
     for turn in range(_TURNS):
         second = _beside(beside, curves[other])
-        start_second, beside_second = _beside_first(observed, second.point, point.curve.effect)
+        start_second, beside_second = _beside_first(observed, second.point, point.effect)
         evidence, before = start + log_prior(beside_second, point) + second.log_evidence, best
         if evidence > best:
-            best, fits = evidence, {point.curve.effect: at, other: second}
+            best, fits = evidence, {point.effect: at, other: second}
         if turn and evidence < before + _SETTLED:
             break
-        at, point, other = second, second.point, point.curve.effect
+        at, point, other = second, second.point, point.effect
         start, beside = start_second, beside_second
     return Pair(log_evidence=best, fits=fits)
 
 
 def _beside_first(observed: Observed, point: Point, other: str) -> tuple[float, Observed]:
     """What a first effect leaves to another, and its log evidence over none without the prior; neither is there by the twin."""
-    both = (point.curve.effect, other)
+    both = (point.effect, other)
     alone = observed.conditioned(*both)
     beside = alone.in_presence_of(point)
     return observed.log_evidence_without(*both) + beside.log_likelihood - alone.log_likelihood, beside

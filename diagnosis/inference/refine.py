@@ -18,7 +18,7 @@ from ..model.changes import Variant
 from ..model.curves import Curve
 from .curve_fits import CurveFit
 from .discrepancy import USUAL_LEVEL
-from .inference import UNKNOWN, Hypothesis
+from .inference import Hypothesis
 from .observed import Observed, Point
 from .search import searched
 from .seen import Blocks, FitTarget, Responder, Whitener
@@ -75,7 +75,7 @@ class Task:
     @property
     def effect(self) -> str:
         """Id of the effect."""
-        return self.own.curve.effect
+        return self.own.effect
 
 
 class _Refinement:
@@ -91,7 +91,7 @@ class _Refinement:
         """Refine an effect; one that is not clearly seen, or beside which the other one of its pair is not, is left as it is."""
         seen = self._standing(task)
         if task.beside is not None:
-            if task.moves_more and not self._clear(task.beside.curve.effect, seen.in_presence_of(self._last(task.own))):
+            if task.moves_more and not self._clear(task.beside.effect, seen.in_presence_of(self._last(task.own))):
                 return
             seen = seen.in_presence_of(self._last(task.beside))
         # brought nearer alone already; the lesser of two is sought anew beside the other, which it may have stood for
@@ -124,12 +124,12 @@ class _Refinement:
 
     def _standing(self, task: Task) -> FitTarget:
         """What a task's effects are fitted to: the twin has its effects but these."""
-        effects = [task.effect] if task.beside is None else [task.effect, task.beside.curve.effect]
+        effects = [task.effect] if task.beside is None else [task.effect, task.beside.effect]
         return replace(self._whole, observed=self._whole.observed.conditioned(*effects))
 
     def _last(self, grid: Point) -> Point:
         """An effect as it was found last; as the grid has it before."""
-        known = self._closer.get(grid.curve.effect)
+        known = self._closer.get(grid.effect)
         return grid if known is None else known.point
 
     def _clear(self, effect: str, seen: FitTarget) -> list[CurveFit]:
@@ -196,10 +196,7 @@ def tasks_of(hypotheses: Sequence[Hypothesis]) -> list[Task]:
     """
     result: list[Task] = []
     for number, hypothesis in enumerate(_within_reach(hypotheses)):
-        at = {
-            effect: Point(curve=curve, strength=hypothesis.strengths[effect][0], level=USUAL_LEVEL)
-            for effect, curve in hypothesis.variants.items()
-        }
+        at = {point.effect: replace(point, level=USUAL_LEVEL) for point in hypothesis.points()}
         moves = {effect: float(np.sum(one.curve.response(one.strength) ** 2)) for effect, one in at.items()}
         more = max(moves, key=lambda effect: moves[effect])
         if number == 0 and len(at) > 1:
@@ -221,7 +218,7 @@ def tasks_of(hypotheses: Sequence[Hypothesis]) -> list[Task]:
 def _within_reach(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """The best known effect or pair, and those that refinement could bring past it, best first; none where no effect helps."""
     known = sorted(
-        (item for item in hypotheses if item.effects and item.effects != (UNKNOWN,)),
+        (item for item in hypotheses if item.of_catalogue),
         key=lambda item: -item.log_evidence,
     )
     if not known or known[0].log_evidence < _LEAST_EVIDENCE:

@@ -14,7 +14,7 @@ from ..inference.inference import UNKNOWN, Hypothesis
 from ..inference.nuisances import LocalNuisances
 from ..inference.observed import Point
 from ..problem.problem import Problem, SeriesView
-from .strengths import strengths_on
+from .strengths import points_on
 
 _DRAWS = 300
 _MOSTLY = 0.5  # of the gap above noise, from which what takes so much explains it
@@ -107,18 +107,12 @@ def left_over(
     nuisances and counts as noise. What their laws, and those of the base's effects, may be off by is fitted as well, so that no
     nuisance is drawn away by it, but neither taken off nor counted.
     """
-    residual = problem.left_by({point.curve.effect: (point.curve, point.strength) for point in added})
-    factors, own = problem.factors, np.ones(len(residual))
-    for point in added:
-        curve, strength = point.curve, point.strength
-        if curve.spread is not None:
-            factors = np.concatenate([factors, strength * curve.spread], axis=1)
-        if curve.jitter is not None:
-            own = own + strength**2 * curve.jitter
+    residual = problem.left_by(added)
+    factors, own = problem.with_chance(added)
     inexact, laws = own[fit], [factors[fit]]
     places = problem.places
-    named = {point.curve.effect for point in added}
-    for point in (*added, *(item for item in problem.given if item.curve.effect not in named)):
+    named = {point.effect for point in added}
+    for point in (*added, *(item for item in problem.given if item.effect not in named)):
         bare = replace(point.curve, spread=None, jitter=None)
         of_law, of_probe = law_terms(bare, point.strength, problem.groups, places, max(point.level, USUAL_LEVEL))
         laws.append(of_law[fit])
@@ -155,14 +149,10 @@ def held_out(
         # what others leave open of the strength would be noise there
         if power[held].sum() <= held.sum() * power[fit].sum():
             told += float(power[held].sum())
-        strengths = strengths_on(problem, leading, effects, fit)
-        added = [
-            Point(curve=leading.variants[effect], strength=strengths[effect], level=leading.levels[effect])
-            for effect in effects
-        ]
+        added = points_on(problem, leading, effects, fit)
         after[held] = left_over(problem, fit, added)[0] if effects else before[held]
-        for one, effect in zip(added, effects, strict=True):
-            alone[effect][held] = left_over(problem, fit, [one])[0]
+        for one in added:
+            alone[one.effect][held] = left_over(problem, fit, [one])[0]
     known = np.isfinite(before)
     before, after, noise, series = before[known], after[known], noise[known], problem.series_of[known]
     axes = np.array([name.axis for name in problem.names])[known]
@@ -193,11 +183,10 @@ def _power(problem: Problem, leading: Hypothesis) -> NDArray[np.float64]:
     """How far what is named moves each probe (probe,), by its law and by what it has in common by chance: squared deviations."""
     total = np.zeros(len(problem.residual))
     nuisances = LocalNuisances(problem.factors, problem.blocks)
-    for effect, curve in leading.variants.items():
-        strength = leading.strengths[effect][0]
-        total += nuisances.given_others(curve.response(strength)) ** 2
-        if curve.spread is not None:
-            total += strength**2 * np.sum(curve.spread**2, axis=1)
+    for point in leading.points():
+        total += nuisances.given_others(point.curve.response(point.strength)) ** 2
+        if point.curve.spread is not None:
+            total += point.strength**2 * np.sum(point.curve.spread**2, axis=1)
     return total
 
 

@@ -172,14 +172,14 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
 
 def _likeliest(hypotheses: Sequence[Hypothesis]) -> Hypothesis | None:
     """The likeliest with effects of the catalogue, where it explains anything."""
-    known = next((item for item in hypotheses if item.effects and item.effects != (UNKNOWN,)), None)
+    known = next((item for item in hypotheses if item.of_catalogue), None)
     return known if known is not None and known.log_evidence > 0.0 else None
 
 
 def _whitened(problem: Problem) -> tuple[Whitening, Observed, tuple[Curve, ...]]:
     """A problem's probes and curves with nuisances of single series integrated out."""
     whitening = Whitening(problem.factors, problem.blocks)
-    had = [point.curve.effect for point in problem.given]
+    had = [point.effect for point in problem.given]
     given = whitening.curves([point.curve for point in problem.given])
     observed = Observed(
         residual=whitening.apply(problem.residual_without(had)[None, :])[0],
@@ -209,9 +209,7 @@ def _with_curves(hypotheses: Sequence[Hypothesis], curves: Sequence[Curve]) -> t
 def _applied_everywhere(hypothesis: Hypothesis) -> list[AppliedEffect]:
     """The effects of a hypothesis as they fit best, less those that act in some series only."""
     return [
-        curve.variant.applied(hypothesis.strengths[effect][0])
-        for effect, curve in hypothesis.variants.items()
-        if not curve.variant.series
+        point.curve.variant.applied(point.strength) for point in hypothesis.points() if not point.curve.variant.series
     ]
 
 
@@ -227,7 +225,7 @@ class Verdict:
     @property
     def named(self) -> tuple[str, ...]:
         """Effects of the leading hypothesis; none where it is the unknown one."""
-        return () if self.leading.effects == (UNKNOWN,) else tuple(self.leading.effects)
+        return self.leading.effects if self.leading.of_catalogue else ()
 
 
 def verdict_of(hypotheses: tuple[Hypothesis, ...]) -> Verdict:
@@ -245,7 +243,7 @@ def verdict_of(hypotheses: tuple[Hypothesis, ...]) -> Verdict:
     else:
         word, total = "ambiguous", 0.0
         for item in hypotheses:
-            if item.effects and item.effects != (UNKNOWN,):
+            if item.of_catalogue:
                 tied.append(item)
             total += item.probability
             if total > _TIED_HOLD:
@@ -274,7 +272,7 @@ def _likeliest_known(
     problem: Problem, verdict: Verdict, rng: np.random.Generator
 ) -> dict[str, tuple[float, float, float]]:
     """How far the likeliest effect of the catalogue shrinks the gap where an unknown one is likelier; empty elsewhere."""
-    known = next((item for item in verdict.hypotheses if len(item.effects) == 1 and item.effects != (UNKNOWN,)), None)
+    known = next((item for item in verdict.hypotheses if len(item.effects) == 1 and item.of_catalogue), None)
     if verdict.word != "unknown_effect" or known is None:
         return {}
     return {effect: found for effect, found in held_out(problem, known, rng)[2].items() if found[0] > _MUCH}
@@ -327,16 +325,10 @@ def _signed(sign: float, strength: tuple[float, float, float]) -> tuple[float, f
 
 def _places_left(problem: Problem, leading: Hypothesis) -> tuple[Place, ...]:
     """Probes that depart with what is named added, beyond what that does by chance."""
-    factors, own = [problem.factors], np.ones(len(problem.residual))
-    for effect, curve in leading.variants.items():
-        strength = leading.strengths[effect][0]
-        if curve.spread is not None:
-            factors.append(strength * curve.spread)
-        if curve.jitter is not None:
-            own += strength**2 * curve.jitter
-    root = np.sqrt(own)
-    nuisances = LocalNuisances(np.concatenate(factors, axis=1) / root[:, None], problem.blocks)
-    return _places(problem, nuisances.given_others(_left(problem, leading) / root))
+    factors, variance = problem.with_chance(leading.points())
+    root = np.sqrt(variance)
+    nuisances = LocalNuisances(factors / root[:, None], problem.blocks)
+    return _places(problem, nuisances.given_others(problem.left_by(leading.points()) / root))
 
 
 def _places(problem: Problem, z: NDArray[np.float64]) -> tuple[Place, ...]:
@@ -368,12 +360,12 @@ def _by_effect(hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
 def _beyond_plausible(leading: Hypothesis) -> tuple[str, ...]:
     """What to say of effects that are weaker or stronger than their plausible range."""
     notes = []
-    for effect, curve in leading.variants.items():
-        known, value = EFFECTS[effect].strength, leading.strengths[effect][0]
-        if not curve.variant.low <= value <= curve.variant.high:
-            side = "weaker" if value < curve.variant.low else "stronger"
+    for point in leading.points():
+        known, variant = EFFECTS[point.effect].strength, point.curve.variant
+        if not variant.low <= point.strength <= variant.high:
+            side = "weaker" if point.strength < variant.low else "stronger"
             notes.append(
-                f"{effect} is {side} than what is plausible as a rule ({known.low:g} to {known.high:g} {known.unit}): such a"
+                f"{point.effect} is {side} than what is plausible as a rule ({known.low:g} to {known.high:g} {known.unit}): such a"
                 " strength was given little weight beforehand"
             )
     return tuple(notes)
@@ -383,7 +375,7 @@ def _of_another_strength(problem: Problem, verdict: Verdict) -> tuple[str, ...]:
     """What to say of effects that the twin has and that are named: how strong the session shows them."""
     notes = []
     for point in problem.given:
-        effect = point.curve.effect
+        effect = point.effect
         if effect in verdict.named:
             value, low, high = (one / point.strength for one in strength_of(problem, verdict.leading, effect))
             notes.append(
@@ -401,16 +393,9 @@ def _in_some(leading: Hypothesis) -> tuple[str, ...]:
     )
 
 
-def _left(problem: Problem, leading: Hypothesis) -> NDArray[np.float64]:
-    """What the leading explanation leaves of the residual (probe,)."""
-    return problem.left_by(
-        {effect: (curve, leading.strengths[effect][0]) for effect, curve in leading.variants.items()}
-    )
-
-
 def _strained(problem: Problem, leading: Hypothesis, nuisances: LocalNuisances) -> tuple[tuple[str, float], ...]:
     """Nuisances that lie far from what is known of them, once the leading explanation is taken off."""
-    left = _left(problem, leading)
+    left = problem.left_by(leading.points())
     if problem.given:
         # what laws of the twin's own effects leave is none of these
         laws = [law_terms(one.curve, one.strength, problem.groups, problem.places, one.level) for one in problem.given]
@@ -454,18 +439,16 @@ def _next_measurement(
     """
     if len(tied) < 2:
         return None
-    first, second = (
-        {effect: (item.variants[effect], item.strengths[effect][0]) for effect in item.effects} for item in tied[:2]
-    )
+    first, second = ([item.point(effect) for effect in item.effects] for item in tied[:2])
     repeat = best_repeat(problem, first, second)
     new = None if repeat is not None and repeat.settles else best_measurement(problem, first, second, rng=rng)
     proposals = [item for item in (repeat, new) if item is not None]
     if not proposals:
         return None
     best = next((item for item in proposals if item.settles), proposals[0])
-    lately = all(curve.variant.since == "calibration" for curve, _ in (*first.values(), *second.values()))
+    lately = all(point.curve.variant.since == "calibration" for point in (*first, *second))
     answer: dict[str, Any] = {
-        "separates": sorted({*first, *second}),
+        "separates": sorted({*tied[0].effects, *tied[1].effects}),
         "text": advice_text(proposals, tied[0].effects, tied[1].effects, lately=lately),
         "separation": best.separation,
         "separation_then": best.separation_then,

@@ -14,7 +14,7 @@ from ..inference.curve_fits import fit_curve
 from ..inference.discrepancy import USUAL_LEVEL, only
 from ..inference.inference import Hypothesis
 from ..inference.nuisances import Nuisances
-from ..inference.observed import Observed
+from ..inference.observed import Observed, Point
 from ..model import changes as scales
 from ..model.curves import Curve
 from ..problem.assemble import map_changes
@@ -39,20 +39,18 @@ def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> Ap
     The fit of a drifting output or a changed gain map knows how much it does by chance, not how much it did, and that of a drifting
     dark takes its whole course: these get the strength that was read.
     """
-    strength = hypothesis.strengths[effect][0]
+    point = hypothesis.point(effect)
     value, low, high = strength_of(problem, hypothesis, effect)
     reading = EFFECTS[effect].reading
     if reading.frame_levels or reading.map_rms or reading.last_dark:
-        strength = value
+        point = replace(point, strength=value)
     return replace(
-        _applied(problem, hypothesis, effect, strength),
-        strength_sd=math.log(high / low) / (2.0 * Z95),
-        law_sd=hypothesis.levels[effect],
+        _applied(problem, point), strength_sd=math.log(high / low) / (2.0 * Z95), law_sd=hypothesis.levels[effect]
     )
 
 
-def _applied(problem: Problem, hypothesis: Hypothesis, effect: str, strength: float) -> AppliedEffect:
-    return with_conditions(hypothesis.variants[effect].variant.applied(strength), problem.conditions)
+def _applied(problem: Problem, point: Point) -> AppliedEffect:
+    return with_conditions(point.curve.variant.applied(point.strength), problem.conditions)
 
 
 def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float]:
@@ -95,12 +93,7 @@ def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[fl
     """The strength at which the probes that define it have their measured values, and its 95 % interval; None: at none."""
     curve = hypothesis.variants[effect]
     exact = np.zeros(len(problem.residual), dtype=bool) if curve.exact is None else curve.exact
-    others = {
-        other: (hypothesis.variants[other], hypothesis.strengths[other][0])
-        for other in hypothesis.effects
-        if other != effect
-    }
-    left = problem.left_by(others, without=[effect])[exact]
+    left = problem.left_by(hypothesis.points(but=effect), without=[effect])[exact]
     lowest, highest = curve.reach
     if len(curve.strengths) > 1:
         # a refined curve is known about its nodes: far from them its cubics may come back to what was measured
@@ -122,7 +115,7 @@ def _output_rms(problem: Problem, hypothesis: Hypothesis, output: str) -> tuple[
     Slow and fast parts of an output that wanders are no one law, but every frame tells its own level. Levels of the calibrating
     series went into the twin, so the mean over the session says nothing of the output.
     """
-    others = [effect for effect in hypothesis.effects if effect != output]
+    others = hypothesis.points(but=output)
     since = hypothesis.variants[output].variant.since == "calibration"
     signals_DN = [mean_over(view.signal_DN, view.mask) for view in problem.views]
     noises = [_noise_of_a_frame(view) for view in problem.views]
@@ -137,8 +130,7 @@ def _output_rms(problem: Problem, hypothesis: Hypothesis, output: str) -> tuple[
     ]
     moved = np.zeros(len(problem.views))
     if others:
-        applied = [_applied(problem, hypothesis, effect, hypothesis.strengths[effect][0]) for effect in others]
-        changes = map_changes(problem, applied)
+        changes = map_changes(problem, [_applied(problem, point) for point in others])
         for number in lit:
             moved[number] = _relative(problem.views[number], changes[number], fields[number])
         lit = [number for number in lit if abs(moved[number]) < _MOST_MOVED]
@@ -161,17 +153,15 @@ def _map_rms(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[flo
     counts as far as laws of their kind are off. None: there is no later flat, another effect is read from the same maps, or noise
     and the usual change of a flat's shape would leave as much.
     """
-    others = [one for one in hypothesis.effects if one != effect]
+    others = hypothesis.points(but=effect)
     later = [
         number
         for number, view in enumerate(problem.views)
         if view.session.series.kind == "flat" and not view.session.calibrates
     ]
-    if not later or any(EFFECTS[one].reading.map_rms for one in others):
+    if not later or any(EFFECTS[one.effect].reading.map_rms for one in others):
         return None
-    changes: dict[str, list[Map]] = {
-        one: map_changes(problem, [_applied(problem, hypothesis, one, hypothesis.strengths[one][0])]) for one in others
-    }
+    changes: dict[str, list[Map]] = {one.effect: map_changes(problem, [_applied(problem, one)]) for one in others}
     variances, sds = [], []
     for number in later:
         view = problem.views[number]
@@ -208,22 +198,21 @@ def _last_dark(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[f
         return None
     number = max(darks)[2]
     view = problem.views[number]
-    others = [one for one in hypothesis.effects if one != effect]
-    best = hypothesis.strengths[effect][0]
+    others, point = hypothesis.points(but=effect), hypothesis.point(effect)
 
     def moved_DN(applied: Sequence[AppliedEffect]) -> float:
         return mean_over(map_changes(problem, applied)[number], view.mask) if applied else 0.0
 
-    of_others = moved_DN([_applied(problem, hypothesis, one, hypothesis.strengths[one][0]) for one in others])
-    own = _applied(problem, hypothesis, effect, best)
-    of_one = moved_DN([own]) / best
+    of_others = moved_DN([_applied(problem, one) for one in others])
+    own = _applied(problem, point)
+    of_one = moved_DN([own]) / point.strength
     if of_one == 0.0:
         return None
     value = (mean_over(view.residual_DN, view.mask) - of_others) / of_one
     frames = math.sqrt(_noise_of_a_frame(view) / view.summary.frames)
-    off = max((EFFECTS[one].reading.law_sd for one in others), default=0.0) * abs(of_others)
+    off = max((EFFECTS[one.effect].reading.law_sd for one in others), default=0.0) * abs(of_others)
     ends = [
-        moved_DN([replace(own, parameters={**own.parameters, inner.name: end})]) / best / of_one
+        moved_DN([replace(own, parameters={**own.parameters, inner.name: end})]) / point.strength / of_one
         for inner in EFFECTS[effect].parameters
         if inner.fitted and inner.name != "strength"
         for end in (inner.low, inner.high)
@@ -264,15 +253,13 @@ def _noise_of_a_frame(view: SeriesView) -> float:
     return mean_over(view.noise_DN**2, view.mask) * view.summary.frames / max(pixels, 1)
 
 
-def strengths_on(
-    problem: Problem, leading: Hypothesis, effects: Sequence[str], fit: NDArray[np.bool_]
-) -> dict[str, float]:
-    """Strengths fitted on part of the probes; with two effects, one after the other, three rounds."""
-    strengths = {effect: leading.strengths[effect][0] for effect in effects}
-    if not effects:
-        return strengths
+def points_on(problem: Problem, leading: Hypothesis, effects: Sequence[str], fit: NDArray[np.bool_]) -> list[Point]:
+    """Effects at strengths fitted on part of the probes; with two effects, one after the other, three rounds."""
+    points = [leading.point(effect) for effect in effects]
+    if not points:
+        return points
     # in the probes as they are: whitening is of the whole session, whose halves it mixes
-    had = [point.curve.effect for point in problem.given]
+    had = [point.effect for point in problem.given]
     part = Observed(
         residual=problem.residual_without(had)[fit],
         nuisances=Nuisances(problem.factors[fit]),
@@ -280,18 +267,15 @@ def strengths_on(
         series=problem.series_of[fit],
         places=problem.places[fit],
         given=tuple(
-            replace(point, curve=point.curve.of_probes(fit))
-            for point in problem.given
-            if point.curve.effect not in effects
+            replace(point, curve=point.curve.of_probes(fit)) for point in problem.given if point.effect not in effects
         ),
     )
-    for _ in range(3 if len(effects) > 1 else 1):
-        for effect in effects:
-            curve = leading.variants[effect]
-            if curve.by_chance_alone:
+    for _ in range(3 if len(points) > 1 else 1):
+        for number, point in enumerate(points):
+            if point.curve.by_chance_alone:
                 continue  # the strength is that of all probes
-            others = {other: (leading.variants[other], strengths[other]) for other in effects if other != effect}
+            others = [other for other in points if other is not point]
             rest = replace(part, residual=problem.left_by(others, without=had)[fit]).conditioned()
-            own = replace(curve.of_probes(fit), spread=None)
-            strengths[effect] = fit_curve(rest, own, levels=only(USUAL_LEVEL)).best
-    return strengths
+            own = replace(point.curve.of_probes(fit), spread=None)
+            points[number] = replace(point, strength=fit_curve(rest, own, levels=only(USUAL_LEVEL)).best)
+    return points

@@ -58,7 +58,7 @@ class CalibratedMaps:
     show over that map, smooth, by name of series, where it stands in; gain_quantum, gain_white: relative variance of one pixel's
     gain, correlated as quanta are, and white; gain_darks: change of the gain, 1/DN, when a calibrating dark is brighter, by
     name: what is subtracted from a series as bright as the calibrating flats was subtracted from these as well; good (row,
-    column): pixels in use; frames: as those of the darks.
+    column): pixels in use.
     """
 
     darks: CalibratedDarks
@@ -69,7 +69,6 @@ class CalibratedMaps:
     gain_white: float
     gain_darks: Mapping[str, float]
     good: NDArray[np.bool_]
-    frames: Mapping[str, int]
 
     @property
     def read_DN2(self) -> float | None:
@@ -176,7 +175,6 @@ def calibrated_maps(
         gain_white=white,
         gain_darks=gain_darks,
         good=lit,
-        frames=frames,
     )
 
 
@@ -215,10 +213,7 @@ def _dark_weights(darks: Sequence[SessionSeries], frames: Mapping[str, int], exp
 
 def _gain_of_twin(twin: Twin) -> NDArray[np.float64]:
     shapes = [level.flat_shape for level in twin.levels]
-    gain = np.asarray(twin.maps.gain_relative, dtype=np.float64)
-    if shapes:
-        gain = np.asarray(np.mean(np.stack(shapes), axis=0), dtype=np.float64)
-    return gain
+    return np.asarray(np.mean(np.stack(shapes), axis=0) if shapes else twin.maps.gain_relative, dtype=np.float64)
 
 
 def _gain_noise_of_twin(twin: Twin) -> tuple[float, float]:

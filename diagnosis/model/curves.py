@@ -1,6 +1,8 @@
 """What an effect would do to the probes at any strength: its responses at a few, and how they are joined."""
 
+from collections.abc import Sequence, Sized
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +89,12 @@ class Curve:
             spread=None if self.spread is None else self.spread / root[:, None],
             jitter=None if self.jitter is None else self.jitter / root**2,
         )
+
+
+def places_of(parts: Sequence[Sized]) -> list[slice]:
+    """Where each of several parts lies among all of them one after the other."""
+    stops = accumulate(map(len, parts))
+    return [slice(stop - len(part), stop) for part, stop in zip(parts, stops, strict=True)]
 
 
 def node_weights(nodes: NDArray[np.float64], strengths: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from ...generator.line.twin import Twin
 from ..probes.registration import SHARP_PX
 from ..session.session import SessionSeries
 from .changes import OF_BEAMS_GROWS, Change, Variant, departures_found
+from .curves import places_of
 
 _CACHE_BYTES = 400_000_000
 _IN_MAPS_OF_BEAMS = "maps of beams"  # the twin's own maps hold what was always there of these
@@ -154,7 +155,6 @@ def own_maps(series: Iterable[SessionSeries]) -> bool:
     return any(item.calibrates and item.series.kind == "flat" for item in series)
 
 
-def strength_rows(variants: Sequence[Variant]) -> list[range]:
+def strength_rows(variants: Sequence[Variant]) -> list[slice]:
     """Where each variant's strengths lie among those of all variants one after the other."""
-    stops = np.cumsum([len(variant.strengths) for variant in variants], dtype=np.intp)
-    return [range(int(stop) - len(variant.strengths), int(stop)) for variant, stop in zip(variants, stops, strict=True)]
+    return places_of([variant.strengths for variant in variants])

@@ -106,7 +106,7 @@ class SessionModel:
     maps: CalibratedMaps
     series: tuple[SeriesModel, ...]
     signals_DN: Mapping[str, float]
-    lines_DN2: tuple[float, float] = (0.0, 0.0)
+    lines_DN2: tuple[float, float]
 
     def usual_lines(self, item: SessionSeries) -> tuple[float, float]:
         """Variance of rows and columns, DN^2, that a series' corrected mean frame has from noise of lines which is no effect."""
@@ -217,7 +217,7 @@ class SessionModel:
             standing += weight**2 / self.maps.darks.frames[name] * lines[name]
         for name, share in self.maps.shares.items():
             there = share * self.signals_DN[one.name] / max(self.signals_DN[name], 1e-9)
-            standing += there**2 / self.maps.frames[name] * lines[name]
+            standing += there**2 / self.maps.darks.frames[name] * lines[name]
         return with_pattern(values, standing, one.context.pattern_noise)
 
     def _found(self, one: SeriesModel, change: Change) -> tuple[Change, SeriesRequest]:
@@ -283,7 +283,7 @@ def session_model(
     summaries: Mapping[str, SeriesSummary],
     clean: NDArray[np.bool_],
     *,
-    lines_DN2: tuple[float, float] = (0.0, 0.0),
+    lines_DN2: tuple[float, float],
 ) -> SessionModel:
     """The session's series as the base twin expects them, with what their scalar probes refer to.
 

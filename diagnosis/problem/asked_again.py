@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ...generator.effects import AppliedEffect
 from ..model.changes import Change, Variant
+from ..model.curves import places_of
 from ..model.forward_model import strength_rows
 from ..model.responses import Asked, SessionModel
 from ..session.even_maps import full_size
@@ -63,7 +64,7 @@ class AskedAgain:
                 there.append(item.beside)
         asked = [self.session.ask(change) for change in (*changes, *(model.with_found([item]) for item in there))]
         responses = np.zeros((len(asked), sum(map(len, self.series))))
-        for one, place in zip(self.series, self._places, strict=True):
+        for one, place in zip(self.series, places_of(self.series), strict=True):
             if wanted is not None and not wanted[place].any():
                 continue
             found = enumerate(self.session.moved(one.probes.series, asked))
@@ -72,8 +73,8 @@ class AskedAgain:
                 responses[list(moved), place] = one.probes.responses(list(moved.values()))
         names = np.repeat([one.probes.series.name for one in self.series], [len(one) for one in self.series])
 
-        def of(variant: Variant, rows: range) -> NDArray[np.float64]:
-            found = responses[list(rows)] + self.done.get(variant.effect, 0.0)
+        def of(variant: Variant, rows: slice) -> NDArray[np.float64]:
+            found = responses[rows] + self.done.get(variant.effect, 0.0)
             if variant.beside is not None:
                 found = found - responses[len(changes) + there.index(variant.beside)]
             return np.where(np.isin(names, variant.series), found, 0.0) if variant.series else found
@@ -81,7 +82,7 @@ class AskedAgain:
         return {
             number: of(variants[number], rows)
             for number, rows in enumerate(strength_rows(variants))
-            if not any(asked[row].failed for row in (*rows, *range(len(changes), len(asked))))
+            if not any(one.failed for one in (*asked[rows], *asked[len(changes) :]))
         }
 
     def border_inflow(self, effect: AppliedEffect) -> NDArray[np.float64] | None:
@@ -101,15 +102,10 @@ class AskedAgain:
             step.label: change for step in self.steps if (change := step.in_presence_of(found.change)) is not None
         }
         asked = {label: self.session.ask(change) for label, change in beside.items()}
-        for one, place in zip(self.series, self._places, strict=True):
+        for one, place in zip(self.series, places_of(self.series), strict=True):
             for name, column in self._of_series(one, found, asked).items():
                 columns.setdefault(name, np.zeros(len(next(iter(columns.values())))))[place] = column
         return notable(columns)
-
-    @property
-    def _places(self) -> list[slice]:
-        stops = np.cumsum([len(one) for one in self.series])
-        return [slice(int(stop) - len(one), int(stop)) for stop, one in zip(stops, self.series, strict=True)]
 
     def _of_series(self, one: ProbedSeries, found: Asked, asked: Mapping[str, Asked]) -> Columns:
         """Responses (probe,) of one series to nuisances; none where the effects do not change what it shows."""

@@ -27,7 +27,7 @@ from ..model.changes import (
     with_pauses,
     with_seams,
 )
-from ..model.curves import LEAST_RESPONSE, Curve
+from ..model.curves import LEAST_RESPONSE, Curve, places_of
 from ..model.defects import lasting_anywhere, memory_of, new_outliers
 from ..model.forward_model import ForwardModel, draft_cache, own_maps, strength_rows
 from ..model.placing import MeasuredScenes, place_scenes
@@ -137,16 +137,15 @@ def _steps_in_twin(model: ForwardModel, *, spectral_steps: float, side: int) -> 
 
 def problem_of(
     session: PreparedSession,
-    twin: Twin,
     *,
     without: Sequence[str] = (),
     variants: Sequence[Variant] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Problem:
-    """What inference is asked about a prepared session, with a twin and `variants` (None: the catalogue less `without`)."""
+    """What inference is asked about a prepared session, with `variants` (None: the catalogue less `without`)."""
     return build_problem(
         session.acquisition,
-        twin,
+        session.twin,
         variants=catalogue_variants(without=without, side=session.factor) if variants is None else variants,
         calibrated_elsewhere=session.calibrated_elsewhere,
         exposed=session.exposed,
@@ -458,11 +457,9 @@ def _factors(blocks: Sequence[SeriesBlock], responses: NDArray[np.float64], comp
     for item, response in zip(compared.asked[first:last], responses[first:last], strict=True):
         if not item.failed:
             columns[item.change.label] = response / item.change.step_sd
-    start = 0
-    for block in blocks:
+    for block, place in zip(blocks, places_of(blocks), strict=True):
         for name, column in block.nuisances.items():
-            columns.setdefault(name, np.zeros(responses.shape[1]))[start : start + len(block)] += column
-        start += len(block)
+            columns.setdefault(name, np.zeros(responses.shape[1]))[place] += column
     return notable(columns)
 
 
@@ -487,14 +484,14 @@ def _curves(
     readout_ms, read_noise_DN = base.instrument.readout_ms, base.noise.read_noise_DN.value
     for variant, rows in zip(compared.variants, strength_rows(compared.variants), strict=True):
         effect = EFFECTS[variant.effect]
-        failed = next((compared.asked[row].failed for row in rows if compared.asked[row].failed), "")
+        failed = next((one.failed for one in compared.asked[rows] if one.failed), "")
         if failed:
             missing.setdefault(variant.effect, failed)
             continue
-        own = responses[list(rows)] + done.get(variant.effect, 0.0)
+        own = responses[rows] + done.get(variant.effect, 0.0)
         spread = border_inflow(session, probes, variant.applied(variant.strengths[0]))
         if spread is None:
-            spread = by_chance(variant, blocks, rows[0], readout_ms)
+            spread = by_chance(variant, blocks, rows.start, readout_ms)
         # a wandering output shifts levels by chance even where too few frames show its noise
         wanders = effect.variation.random == "output" and spread is not None and bool(np.any(spread))
         if not (wanders or float(np.max(np.abs(own))) > LEAST_RESPONSE):

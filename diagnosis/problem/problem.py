@@ -98,21 +98,29 @@ class Problem:
         """The residual (probe,) of the base less those of its own effects that are among these."""
         left = self.residual.copy()
         for point in self.given:
-            if point.curve.effect in effects:
+            if point.effect in effects:
                 left += point.curve.response(point.strength)
         return left
 
-    def left_by(
-        self, strengths: Mapping[str, tuple[Curve, float]], *, without: Sequence[str] = ()
-    ) -> NDArray[np.float64]:
-        """What effects, with their curves and strengths, leave of the residual (probe,).
+    def left_by(self, points: Sequence[Point], *, without: Sequence[str] = ()) -> NDArray[np.float64]:
+        """What effects at their strengths leave of the residual (probe,).
 
         They take the place of the base's own; of these, those in `without` are not there either.
         """
-        left = self.residual_without((*strengths, *without))
-        for curve, strength in strengths.values():
-            left -= curve.response(strength)
+        left = self.residual_without((*(point.effect for point in points), *without))
+        for point in points:
+            left -= point.curve.response(point.strength)
         return left
+
+    def with_chance(self, points: Sequence[Point]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Factors (probe, factor) of nuisances and of what effects do by chance; variance (probe,) of each probe by itself."""
+        factors, variance = [self.factors], np.ones(len(self.residual))
+        for point in points:
+            if point.curve.spread is not None:
+                factors.append(point.strength * point.curve.spread)
+            if point.curve.jitter is not None:
+                variance += point.strength**2 * point.curve.jitter
+        return np.concatenate(factors, axis=1), variance
 
     @property
     def places(self) -> NDArray[np.intp]:

@@ -11,6 +11,7 @@ from ...generator.effects import EFFECTS
 from ...generator.line.line_state import FixedPattern, TilePattern, between_lines
 from ..model import changes as scales
 from ..model.changes import Variant
+from ..model.curves import places_of
 from ..model.responses import Asked, Moved
 from ..probes.probes import ProbeName
 from ..probes.scalar_context import time_templates
@@ -138,12 +139,6 @@ def _random_of(label: str) -> str:
     return EFFECTS[label].variation.random if label in EFFECTS else ""
 
 
-def _places(blocks: Sequence[SeriesBlock]) -> list[slice]:
-    """Where each series' probes lie among those of all."""
-    stops = np.cumsum([len(block) for block in blocks])
-    return [slice(int(stop) - len(block), int(stop)) for block, stop in zip(blocks, stops, strict=True)]
-
-
 def by_chance(
     variant: Variant, blocks: Sequence[SeriesBlock], row: int, readout_ms: float | None
 ) -> NDArray[np.float64] | None:
@@ -155,7 +150,7 @@ def by_chance(
     random = EFFECTS[variant.effect].variation.random
     if random == "sides":
         sides = np.zeros((sum(map(len, blocks)), 2))
-        for block, place in zip(blocks, _places(blocks), strict=True):
+        for block, place in zip(blocks, places_of(blocks), strict=True):
             if row in block.uneven:
                 sides[place] = block.uneven[row].T
         return sides * (scales.UNEVEN_SHARE / variant.strengths[0])
@@ -199,7 +194,7 @@ def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: floa
     size = sum(map(len, blocks))
     lit = [
         (block, place)
-        for block, place in zip(blocks, _places(blocks), strict=True)
+        for block, place in zip(blocks, places_of(blocks), strict=True)
         if block.session.request.beam_on and (variant.since == "always" or not block.session.calibrates)
     ]
     if not lit:

@@ -41,7 +41,7 @@ class MeanFrame:
     mask: NDArray[np.bool_]
     quantum_DN2: NDArray[np.float64]
     white_DN2: NDArray[np.float64]
-    rendered: float = RENDER_SHARE
+    rendered: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,8 +197,8 @@ def series_probes(
     variants: Sequence[Variant],
     all_outliers: int,
     memory: tuple[float, int] | None,
-    copies: int = 0,
-    lasting: NDArray[np.bool_] | None = None,
+    copies: int,
+    lasting: NDArray[np.bool_],
 ) -> SeriesProbes:
     """The probes of one series.
 
@@ -214,7 +214,7 @@ def series_probes(
         copies: of frames, that this series counts.
         lasting: pixels (row, column) whose level lasts in a later dark; they are no outliers.
     """
-    first = [(variant, moved[rows[0]]) for variant, rows in zip(variants, strength_rows(variants), strict=True)]
+    first = [(variant, moved[rows.start]) for variant, rows in zip(variants, strength_rows(variants), strict=True)]
     projection = MapProjection(
         _templates(session, one, frame, [(variant, found[0]) for variant, found in first if found is not None]),
         mask=frame.mask,
@@ -234,7 +234,7 @@ def series_probes(
             noise,
             float(pattern[0]),
             clean=clean,
-            good=good if lasting is None else good & ~lasting,
+            good=good & ~lasting,
             least_DN=least_DN,
         )
     scalars = measured_scalars(
@@ -247,7 +247,7 @@ def series_probes(
         all_outliers=all_outliers,
         memory=memory,
         copies=copies,
-        lasting=0 if lasting is None else int(np.count_nonzero(lasting)),
+        lasting=int(np.count_nonzero(lasting)),
     )
     scalars = [probe for probe in scalars if probe.name in one.scalars]
     if one.placement is not None and one.tells_displacement:

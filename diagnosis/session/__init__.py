@@ -6,7 +6,6 @@ Files:
     usable        which series can be compared, and the two passes over their frames
     summaries     statistics of the frames of one series
     origin        whether a twin was calibrated from these very series
-    inapplicable  effects that a detector of another kind may have
     binning       how many pixels are binned on large panels
     binned_twin   a twin with squares of pixels for pixels
     even_maps     maps that are the same everywhere, stored as one number

@@ -17,9 +17,10 @@ from ...checks.findings import Finding, FindingCode
 from ...checks.labels import LabelCheck, check_labels
 from ...checks.readings import Explained
 from ...errors import FitError, InputError, RaytwinError
+from ...generator.effects import EFFECTS
 from ...generator.line.twin import Twin
 from .binned_twin import binned_twin
-from .binning import LEAST_SIDE, bin_factor
+from .binning import LEAST_SIDE, bin_factor, lost_by_binning
 from .origin import made_of
 
 _OF_THIS_SESSION = (
@@ -55,6 +56,17 @@ class PreparedSession:
     all_pixels: AcquisitionFile
     ends_at_zero: frozenset[str]
     spectral_point: NDArray[np.float64] | None
+
+    @property
+    def lost(self) -> dict[str, str]:
+        """Why effects cannot be seen in its squares of pixels, by id."""
+        return lost_by_binning() if self.factor > 1 else {}
+
+    @property
+    def out_of_question(self) -> tuple[str, ...]:
+        """Ids of effects that are not tried: lost ones, and those of photon counters where the instrument says that it is none."""
+        counts_none = self.twin.instrument.counting is False
+        return (*self.lost, *(effect.id for effect in EFFECTS.values() if counts_none and "counting" in effect.needs))
 
 
 def calibrated_twin(

@@ -22,7 +22,7 @@ _ONE_RATE = 1.25  # largest over smallest level a unit of exposure that one unkn
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionSeries:
-    """One series and its part: `calibrates` (dark and gain maps come from it), `after` (later than the calibration).
+    """One series and its request to the forward model; calibrates: dark and gain maps come from it.
 
     own_noise: the flats that calibrate its beam are single frames, so that the twin has the noise from series like this one.
     divided: its frames were divided by an open field measured elsewhere, so that their level says nothing.
@@ -32,11 +32,10 @@ class SessionSeries:
     series: Series
     request: SeriesRequest
     calibrates: bool
-    after: bool
-    own_noise: bool = False
-    divided: bool = False
-    shares: bool = False
-    ends_at_zero: bool = False
+    own_noise: bool
+    divided: bool
+    shares: bool
+    ends_at_zero: bool
 
     @property
     def name(self) -> str:
@@ -220,7 +219,6 @@ def read_session(
                 series=item,
                 request=request,
                 calibrates=calibrates,
-                after=after,
                 own_noise=item.kind != "dark" and beam_of(item) in noiseless,
                 divided=bool(item.corrected & {"gain", "log"}),
                 shares=(shares := holds_shares(item)),

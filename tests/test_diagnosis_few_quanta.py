@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.probes.few_quanta import enough_quanta, tails_of_quanta
+from raytwin.diagnosis.probes.noise_tails import enough_quanta, tails_of_quanta
 from raytwin.diagnosis.probes.scalar_context import Areas
 from raytwin.diagnosis.session.summaries import summarise_series
 

@@ -753,7 +753,7 @@ def test_a_refined_curve_goes_as_far_as_the_model_can_be_asked():
         return {0: np.outer(variants[0].strengths, response)} if max(variants[0].strengths) < 10.0 else {}
 
     observed = seen(9.0 * response + 0.1 * rng.standard_normal(PROBES))
-    what = FitTarget(observed=observed, respond=respond, whitener=SimpleNamespace(apply=np.asarray))
+    what = FitTarget(observed=observed, respond=respond, whitening=SimpleNamespace(apply=np.asarray))
     fit = what.fit(grid)
     assert fit.best == pytest.approx(7.5)  # as far as the grid is believed
     found = searched(fit, what)
@@ -797,7 +797,7 @@ def test_an_interval_holds_what_inner_parameters_leave_open():
             found,
             observed=observed,
             respond=respond,
-            whitener=SimpleNamespace(apply=np.asarray),
+            whitening=SimpleNamespace(apply=np.asarray),
         )
         (_, low, high), (_, low_as_found, high_as_found) = (one.strengths["veiling_glare"] for one in (opened, found))
         held += low < truth < high

@@ -14,11 +14,12 @@ from raytwin.diagnosis.inference.inference import Hypothesis, weigh_hypotheses
 from raytwin.diagnosis.inference.nuisances import Nuisances
 from raytwin.diagnosis.inference.observed import Observed, Point
 from raytwin.diagnosis.inference.unknown import Families
+from raytwin.diagnosis.judgement.answer import improved
 from raytwin.diagnosis.judgement.judgement import Verdict, _of_another_strength
 from raytwin.diagnosis.model.changes import Variant
 from raytwin.diagnosis.model.curves import Curve
 from raytwin.diagnosis.model.forward_model import ForwardModel
-from raytwin.diagnosis.problem.known_effects import lasting, with_found
+from raytwin.diagnosis.problem.assemble import known_by_law
 from raytwin.diagnosis.problem.problem import Problem
 from raytwin.generator.effects import AppliedEffect
 
@@ -34,8 +35,9 @@ def effect(name, strength):
 
 def test_what_is_found_takes_the_place_of_the_same_effect():
     had = (effect("image_lag", 1.0), effect("output_drift", 0.4))
-    found = with_found(had, (effect("output_drift", 0.6), effect("mtf_tail", 5.0)))
-    assert [(item.id, item.parameters["strength"]) for item in found] == [
+    twin = make_dataclass("Twin", ["effects"])(had)
+    found = improved(twin, (effect("output_drift", 0.6), effect("mtf_tail", 5.0)))
+    assert [(item.id, item.parameters["strength"]) for item in found.effects] == [
         ("image_lag", 1.0),
         ("output_drift", 0.6),
         ("mtf_tail", 5.0),
@@ -44,7 +46,7 @@ def test_what_is_found_takes_the_place_of_the_same_effect():
 
 def test_effects_that_act_by_chance_are_sought_again():
     had = (effect("image_lag", 1.0), effect("output_drift", 0.4), effect("gain_map_error", 0.5))
-    assert [item.id for item in lasting(had)] == ["image_lag"]
+    assert [item.id for item in known_by_law(had)] == ["image_lag"]
 
 
 def curve(name, response):

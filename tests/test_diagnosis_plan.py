@@ -156,7 +156,7 @@ def refined(variants, law, residual, blocks=None, asked_of=None):
         curves=curves,
         observed=observed,
         respond=answer,
-        whitener=SimpleNamespace(apply=lambda vectors: vectors),
+        whitening=SimpleNamespace(apply=lambda vectors: vectors),
         blocks=blocks,
     )
 

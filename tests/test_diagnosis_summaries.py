@@ -13,9 +13,9 @@ from raytwin.diagnosis.model.curves import node_weights
 from raytwin.diagnosis.model.defects import memory_of
 from raytwin.diagnosis.model.placing import _smeared
 from raytwin.diagnosis.probes.frame_scalars import _log_variance_of_steps, measured_scalars
-from raytwin.diagnosis.probes.lost_bits import rounded_kurtosis
 from raytwin.diagnosis.probes.map_probes import MapProjection, Template
 from raytwin.diagnosis.probes.moving_picture import MovingPicture
+from raytwin.diagnosis.probes.noise_tails import rounded_kurtosis
 from raytwin.diagnosis.probes.registration import Placement, register, register_drawn, resample
 from raytwin.diagnosis.probes.scalar_context import Areas, ScalarContext
 from raytwin.diagnosis.session.summaries import BLOCK_PX, LAGS, _codes, look_at_series, summarise_series
@@ -496,7 +496,16 @@ def test_correlations_are_as_uncertain_as_the_neighbours_of_one_label_are_few():
     for seed in range(40):
         summary = summarise_series([flat_frames(np.random.default_rng(seed))], good=np.ones(SHAPE, bool), labels=labels)
         for one in measured_scalars(
-            summary, white, context, dark_mean_DN=0.0, pattern=None, outliers=None, all_outliers=0, memory=None
+            summary,
+            white,
+            context,
+            dark_mean_DN=0.0,
+            pattern=None,
+            outliers=None,
+            all_outliers=0,
+            memory=None,
+            copies=0,
+            lasting=0,
         ):
             if one.name.startswith("correlation"):
                 found.setdefault(one.name, []).append(one.value / one.sampling_sd)

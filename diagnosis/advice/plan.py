@@ -17,6 +17,7 @@ from ...generator.effects import EFFECTS
 from ..inference.inference import title_of
 from ..inference.nuisances import Nuisances, Whitening
 from ..inference.observed import Point
+from ..inference.refine import SEEN_FROM
 from ..model.curves import Curve, places_of
 from ..problem.problem import Problem
 
@@ -25,7 +26,6 @@ _FINE_GRID = 121  # strengths that are asked whether they are seen
 CLEAR = 5.0  # standard deviations
 _REPEATS = 4  # times as many frames
 _CANDIDATES = 4
-WORTH_IT = 3.0  # standard deviations that a measurement adds between two explanations, from which it settles the matter
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,7 +140,7 @@ class Proposal:
     @property
     def settles(self) -> bool:
         """Whether the matter is settled with it: what is as it was told the two apart no better, however clearly it would."""
-        return self.separation_then**2 - self.separation**2 >= WORTH_IT**2
+        return self.separation_then**2 - self.separation**2 >= SEEN_FROM**2
 
 
 def advice_text(proposals: Sequence[Proposal], first: Sequence[str], second: Sequence[str], *, lately: bool) -> str:
@@ -165,7 +165,7 @@ def advice_text(proposals: Sequence[Proposal], first: Sequence[str], second: Seq
     )
     weighed = "; ".join(f"{item.what}: {item.separation_then:.1f}" for item in proposals)
     text = (
-        f"nothing that was weighed tells {names} by {WORTH_IT:g} standard deviations more ({weighed}; now"
+        f"nothing that was weighed tells {names} by {SEEN_FROM:g} standard deviations more ({weighed}; now"
         f" {proposals[0].separation:.1f})."
     )
     if lately and any(item.measured for item in proposals):

@@ -19,15 +19,16 @@ from ..model.curves import Curve
 from .curve_fits import fit_curve, interval_of
 from .discrepancy import only
 from .inference import Hypothesis
+from .nuisances import Whitening
 from .observed import Observed
 from .search import from_middle, slopes_of
-from .seen import FitTarget, Responder, Whitener
+from .seen import FitTarget, Responder
 
 _SD = 1.0 / math.sqrt(3.0)  # of what is even over a range, in halves of it
 
 
 def with_inner_open(
-    hypothesis: Hypothesis, *, observed: Observed, respond: Responder, whitener: Whitener
+    hypothesis: Hypothesis, *, observed: Observed, respond: Responder, whitening: Whitening
 ) -> Hypothesis:
     """A hypothesis whose strengths' intervals hold what its laws' inner parameters leave open.
 
@@ -35,9 +36,9 @@ def with_inner_open(
         hypothesis: with whitened curves.
         observed: what is weighed, whitened.
         respond: asks the forward model.
-        whitener: of its responses.
+        whitening: of its responses.
     """
-    seen = FitTarget(observed=replace(observed, given=()), respond=respond, whitener=whitener)
+    seen = FitTarget(observed=replace(observed, given=()), respond=respond, whitening=whitening)
     opened = {point.effect: _opened(point.curve, point.strength, seen) for point in hypothesis.points()}
     if all(opened[effect] is curve for effect, curve in hypothesis.variants.items()):
         return hypothesis

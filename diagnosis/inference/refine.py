@@ -19,9 +19,10 @@ from ..model.curves import Curve
 from .curve_fits import CurveFit
 from .discrepancy import USUAL_LEVEL
 from .inference import Hypothesis
+from .nuisances import Whitening
 from .observed import Observed, Point
 from .search import searched
-from .seen import Blocks, FitTarget, Responder, Whitener
+from .seen import Blocks, FitTarget, Responder
 
 _MOST_EFFECTS = 4
 # of the best on the grid over none: refinement adds some fifth to it, and far more is needed to be named
@@ -29,7 +30,8 @@ _LEAST_EVIDENCE = 1.0
 _REACH = 0.6  # share of the best evidence from which an effect is refined
 _REACH_CHANCE = 30.0  # log evidence below that
 _REACH_OF_PAIRS = 3.0  # log evidence that a pair may lie below its first effect alone
-SEEN_FROM = 3.0  # standard deviations from none at which an effect shows: a session can test it, and it is refined
+# standard deviations at which an effect shows beside none, so that it is tested and refined, and one explanation beside another
+SEEN_FROM = 3.0
 _STARTS = 2
 _OTHER_ONSET = 0.5  # share of the leading evidence from which a start with the other onset is refined as well
 
@@ -40,7 +42,7 @@ def refine(
     curves: Sequence[Curve],
     observed: Observed,
     respond: Responder,
-    whitener: Whitener,
+    whitening: Whitening,
     blocks: Blocks | None = None,
 ) -> list[tuple[Variant, NDArray[np.float64]]]:
     """Variants nearer to what was measured than those of the grid, with their responses (strength, probe).
@@ -50,10 +52,10 @@ def refine(
         curves: of the grid, whitened.
         observed: what is weighed, whitened.
         respond: asks the forward model.
-        whitener: of responses.
+        whitening: of responses.
         blocks: of series that share local nuisances; the search asks those that tell most. None: it asks all.
     """
-    whole = FitTarget(observed=observed, respond=respond, whitener=whitener, blocks=blocks)
+    whole = FitTarget(observed=observed, respond=respond, whitening=whitening, blocks=blocks)
     refinement = _Refinement(whole, curves)
     for task in tasks_of(hypotheses):
         refinement.run(task)

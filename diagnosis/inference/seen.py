@@ -11,6 +11,7 @@ from ..model.changes import Variant
 from ..model.curves import Curve
 from .curve_fits import CurveFit, fit_curve
 from .discrepancy import LEVELS, USUAL_LEVEL, only
+from .nuisances import Whitening
 from .observed import Observed, Point
 
 _TELLS = 0.8  # share of what tells an effect, its law off as usual, that the series of a search hold
@@ -26,12 +27,6 @@ class Responder(Protocol):
     def __call__(
         self, asked: Sequence[Variant], /, wanted: NDArray[np.bool_] | None = None
     ) -> Mapping[int, NDArray[np.float64]]: ...
-
-
-class Whitener(Protocol):
-    """Responses with the local nuisances integrated out."""
-
-    def apply(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,14 +59,14 @@ class Blocks:
 class FitTarget:
     """What one effect is fitted to, beside others, and how the forward model is asked for more of it.
 
-    Its curves are whitened and in the units of the first probes. Fields: observed; respond: the forward model; whitener of its
+    Its curves are whitened and in the units of the first probes. Fields: observed; respond: the forward model; whitening of its
     responses; blocks of series (None: all are asked); wanted: which of all probes these are (None: all); level: by which laws are
     taken to be off.
     """
 
     observed: Observed
     respond: Responder
-    whitener: Whitener
+    whitening: Whitening
     blocks: Blocks | None = None
     wanted: NDArray[np.bool_] | None = None
     level: float = USUAL_LEVEL
@@ -101,7 +96,7 @@ class FitTarget:
 
     def own(self, responses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Responses of all probes as the forward model gives them, whitened, of these probes."""
-        whitened = self.whitener.apply(responses)
+        whitened = self.whitening.apply(responses)
         return whitened if self.wanted is None else whitened[:, self.wanted]
 
     def cut(self, curve: Curve) -> Curve:

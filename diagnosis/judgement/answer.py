@@ -10,7 +10,6 @@ from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.line.twin import Twin
 from ...results import Result, Table, axes_or_new, frame, plain
 from ..inference.inference import Hypothesis
-from ..problem.known_effects import with_found
 from ..problem.problem import Problem
 from ..session.binning import lost_by_binning, parameters_in_pixels
 from .held_out import Gap
@@ -143,7 +142,18 @@ class Diagnosis(Result):
     def plot_gap(self, ax: Any = None) -> Any:
         """The gap on held-out probes before and after, by axis, with the floor of measured against measured; returns the axes."""
         gap = self.gap
-        return plot_gap_rows([("all", gap.before, gap.after, gap.floor), *self.held_out], ax=axes_or_new(ax))
+        ax = axes_or_new(ax)
+        rows = [("all", gap.before, gap.after, gap.floor), *self.held_out]
+        for place, (_, before, after, floor) in enumerate(rows):
+            first = place == 0
+            ax.barh(place - 0.18, before, height=0.34, color="#9aa5b1", label="before" if first else None)
+            ax.barh(place + 0.18, after, height=0.34, color="#1f5fa8", label="after" if first else None)
+            ax.plot([floor] * 2, [place - 0.4, place + 0.4], color="#d9822b", lw=2, label="floor" if first else None)
+        ax.set_yticks(range(len(rows)), [name for name, _, _, _ in rows])
+        ax.invert_yaxis()
+        ax.set_xlabel("gap on held-out probes (1 = nothing but noise)")
+        ax.legend(frameon=False)
+        return ax
 
     def plot(self, ax: Any = None) -> Any:
         """Probability of every hypothesis that was weighed, the most probable first; returns the axes."""
@@ -182,18 +192,10 @@ def _diagnosis_from_fields(values: dict[str, Any]) -> Diagnosis:
     return Diagnosis(**values)
 
 
-def plot_gap_rows(rows: Sequence[tuple[str, float, float, float]], *, ax: Any) -> Any:
-    """The gap before and after with its floor, a bar each, from rows of (name, before, after, floor); returns the axes."""
-    for place, (_, before, after, floor) in enumerate(rows):
-        first = place == 0
-        ax.barh(place - 0.18, before, height=0.34, color="#9aa5b1", label="before" if first else None)
-        ax.barh(place + 0.18, after, height=0.34, color="#1f5fa8", label="after" if first else None)
-        ax.plot([floor] * 2, [place - 0.4, place + 0.4], color="#d9822b", lw=2, label="floor" if first else None)
-    ax.set_yticks(range(len(rows)), [name for name, _, _, _ in rows])
-    ax.invert_yaxis()
-    ax.set_xlabel("gap on held-out probes (1 = nothing but noise)")
-    ax.legend(frameon=False)
-    return ax
+def improved(twin: Twin, added: Sequence[AppliedEffect]) -> Twin:
+    """A twin with effects that were found, which take the place of the same ones that it has."""
+    found = {item.id for item in added}
+    return replace(twin, effects=(*(item for item in twin.effects if item.id not in found), *added))
 
 
 def in_pixels(diagnosis: Diagnosis, *, twin: Twin, factor: int) -> Diagnosis:
@@ -227,7 +229,7 @@ def in_pixels(diagnosis: Diagnosis, *, twin: Twin, factor: int) -> Diagnosis:
         diagnosis,
         added=added,
         causes=tuple(causes),
-        twin=replace(twin, effects=with_found(twin.effects, added)),
+        twin=improved(twin, added),
         not_tested={**diagnosis.not_tested, **lost_by_binning()},
         notes=(*diagnosis.notes, text),
     )

@@ -17,8 +17,7 @@ from ..problem.problem import Problem, SeriesView
 from .strengths import points_on
 
 _DRAWS = 300
-_MOSTLY = 0.5  # of the gap above noise, from which what takes so much explains it
-_MOST_TESTED = 0.5  # of what an explanation does, as a share of its squares
+MOST = 0.5  # share of the gap above noise, or of the squares of what an explanation does, that is most of it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,7 +48,7 @@ class Gap:
         """Whether what was found takes most of what is above noise, as far as held-out data can tell."""
         if not self.tested or self.at_floor:
             return True
-        return self.falls and (self.shrinks_by is None or self.shrinks_by[0] > _MOSTLY)
+        return self.falls and (self.shrinks_by is None or self.shrinks_by[0] > MOST)
 
 
 def folds_of(problem: Problem) -> NDArray[np.intp]:
@@ -174,7 +173,7 @@ def held_out(
         after=_rms(after),
         floor=floor,
         shrinks_by=shrinkage_of(before, after, floor, series, rng) if effects else None,
-        tested=told >= _MOST_TESTED * float(power.sum()),
+        tested=told >= MOST * float(power.sum()),
     )
     return gap, tuple(rows), shares
 

@@ -22,16 +22,14 @@ from ..inference.refine import SEEN_FROM, refine
 from ..inference.steady import Steady
 from ..model.changes import Variant
 from ..model.curves import Curve
-from ..problem.known_effects import with_found
 from ..problem.problem import Problem
-from .answer import NO_GAP_FROM, Cause, Diagnosis, Place
-from .held_out import held_out
+from .answer import NO_GAP_FROM, Cause, Diagnosis, Place, improved
+from .held_out import MOST, held_out
 from .strengths import applied_at_best, strength_of
 
 EXPLAINED_FROM = 0.6  # probability of an effect (over all hypotheses) from which it is named as the explanation
 _TIED_HOLD = 0.9  # probability that the hypotheses which are tied hold together, none and an unknown effect counted
 _WORST_PLACES = 30
-_MUCH = 0.5  # of the gap that an effect removes to be listed, though an unknown one is likelier
 _WORTH_LISTING = 0.02  # probability of an effect that is neither named nor tied
 STRAINED_FROM = 5.0  # prior standard deviations
 _OF_RENDERING = ("rough edge", "edges,", "outline of", "gain map", "texture")  # nuisances that nobody can look up
@@ -73,7 +71,7 @@ def judge(
         held_out=by_axis,
         ambiguous_with=_indistinct(verdict.tied) if ambiguous else (),
         next_measurement=_next_measurement(problem, verdict.tied, rng) if ambiguous else None,
-        twin=replace(twin, effects=with_found(twin.effects, added)),
+        twin=improved(twin, added),
         added=added,
         named=named,
         problem=problem,
@@ -134,7 +132,7 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
         curves=whitened,
         observed=observed,
         respond=problem.respond,
-        whitener=whitening,
+        whitening=whitening,
         blocks=problem.asked_in_blocks,
     )
     problem = problem.with_variants(closer)
@@ -155,7 +153,7 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
         seen = [(one, fit_effects(one, alone)) for one in levels]
     hypotheses = weigh(seen, misfits=True)
     hypotheses = tuple(
-        with_inner_open(item, observed=observed, respond=problem.respond, whitener=whitening)
+        with_inner_open(item, observed=observed, respond=problem.respond, whitening=whitening)
         if item.probability > _WORTH_LISTING
         else item
         for item in hypotheses
@@ -271,11 +269,11 @@ def _indistinct(tied: Sequence[Hypothesis]) -> tuple[tuple[str, str], ...]:
 def _likeliest_known(
     problem: Problem, verdict: Verdict, rng: np.random.Generator
 ) -> dict[str, tuple[float, float, float]]:
-    """How far the likeliest effect of the catalogue shrinks the gap where an unknown one is likelier; empty elsewhere."""
+    """How far the likeliest effect of the catalogue shrinks the gap, if by most of it and an unknown one is likelier; else empty."""
     known = next((item for item in verdict.hypotheses if len(item.effects) == 1 and item.of_catalogue), None)
     if verdict.word != "unknown_effect" or known is None:
         return {}
-    return {effect: found for effect, found in held_out(problem, known, rng)[2].items() if found[0] > _MUCH}
+    return {effect: found for effect, found in held_out(problem, known, rng)[2].items() if found[0] > MOST}
 
 
 def _causes(

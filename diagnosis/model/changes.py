@@ -58,11 +58,12 @@ ROUGH_FIELDS = 24
 BEYOND_SD = 1.0  # beyond a border: 0 a picture that mirrors there, 1 one that goes on as it ends, 2 an edge that runs straight on
 ROUGH_SHARE = 0.9  # of the local slope: rendering along an edge, from place to place
 SPREAD_SD = 0.05  # of the calibrated optical spread: calibration may have taken in an effect
-TEXTURE_SD = 0.003  # of the correlation of neighbours at each lag, the same in all series
+TEXTURE_SD = (
+    0.003  # of the correlation of neighbours at each lag, the same in all series, and as much again in those of a kV
+)
 READ_TEXTURE_SD = (
     0.05  # of the read noise's correlation at each lag: what an amplifier keeps that settles for three time constants
 )
-TEXTURE_OF_BEAM_SHARE = 1.0  # of this that may differ from kV to kV
 # always there a little, without being an effect: limits of the catalogue's table; beyond them the effect of that kind begins
 SHAPE_SD = 0.0005  # rms over the field of the smooth change of the open field's shape: of a series, and of all since the calibration
 SHAPE_ORDER = 4  # of the polynomials that stand for it, each order half as likely as the one of half its number
@@ -266,12 +267,8 @@ def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
             values = [0.0, 1.0]  # a share: none or all
         else:
             span = item.high - item.low
-            count = 4 if item.is_angle else 2
-            values = (
-                [item.low + span * k / count for k in range(count)]
-                if count == 4
-                else [item.low + 0.25 * span, item.low + 0.75 * span]
-            )
+            quarters = range(4) if item.is_angle else (1, 3)
+            values = [item.low + span * k / 4 for k in quarters]
         grown = [{**choice, item.name: value} for choice in choices for value in values]
         choices = grown if len(grown) <= _MOST_VARIANTS else [{**c, item.name: item.default} for c in choices]
     if effect.grid.variants:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from . import _node_loops
 from .changes import Variant
 
-LEAST_RESPONSE = 1e-3  # standard deviations of a probe, below which nothing responds
+LEAST_RESPONSE = 1e-3  # standard deviations of a probe, below which it responds to nothing, effect or nuisance
 STRENGTH_NODES = 37
 _WEAKER = 30.0  # times below its plausible range that an effect is tried
 _STRONGER = 2.5  # times above it where the response grows in proportion to the strength

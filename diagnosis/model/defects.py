@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...generator.frames.line_model import ExpectedSeries
 from ..probes.fixed_pattern import smooth_part
 from ..probes.lasting import OUTLYING, lasting_pixels
-from ..session.even_maps import near_steps, signal_map
+from ..session.even_maps import NEIGHBOURS_PX, near_steps, signal_map
 from ..session.session import SessionSeries
 from ..session.summaries import BLOCK_PX, LEAST_NOISE_DN2, FirstLook
 from .calibrated_maps import CalibratedMaps
@@ -113,7 +113,7 @@ def _out_in_every_object(
             measured = maps.corrected(item, looks[item.name].mean_DN)
             signal = signal_map(expected[item.name], good.shape)
             residual = measured - signal
-            residual = residual - median_filter(residual, size=5, mode="nearest")
+            residual = residual - median_filter(residual, size=NEIGHBOURS_PX, mode="nearest")
             even = ~near_steps(signal)
             views += even
             spread = max(1.4826 * float(np.median(np.abs(residual[good]))), 1e-9)

@@ -14,7 +14,6 @@ Files:
     straight_edge       how truly a straight edge is drawn, by its oversampled profile
     moving_picture      noise that a fading picture seems to add
     noise_correlation   correlation of neighbouring pixels' noise, summed
-    lost_bits           kurtosis of rounded noise
-    few_quanta          kurtosis of noise of few quanta
+    noise_tails         kurtosis of noise of few quanta, and of rounded noise
     _projection_loops   templates weighed by the noise, compiled
 """

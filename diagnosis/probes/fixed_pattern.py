@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.line_state import FixedPattern, TilePattern
-from ..session.even_maps import mean_over
+from ..session.even_maps import NEIGHBOURS_PX, mean_over
 from ..session.summaries import BLOCK_PX, LEAST_NOISE_DN2, in_blocks
 from .noise_correlation import autocovariance, correlation_sum
 
 OUTLIER_SD = 7.0
 _LEAST_BLOCKS, _LEAST_LINES = 8, 16
 _LEAST_SURFACE = 5 * BLOCK_PX  # side of a panel, px, through which a cubic surface can be laid
-_NEIGHBOURS_PX = 5  # side of the square that a pixel's neighbours are in
 _OUT_OF_NEIGHBOURS = 3.0  # times the distance of their quartiles; of noise 7 standard deviations are 5
 _LINE_CLEAN = 0.2  # share of a line's pixels that do not stand out, below which the line as a whole may have changed
 _LINE_CHANGE = 0.15  # relative change of a line's gain beyond which it counts as a defect
@@ -234,8 +233,8 @@ def count_outliers(
     out = (np.abs(level - float(np.median(level[clean]))) > limit) & good
     if not out.any():
         return 0
-    around = np.pad(np.where(clean, level, np.nan), _NEIGHBOURS_PX // 2, constant_values=np.nan)
-    windows = sliding_window_view(around, (_NEIGHBOURS_PX, _NEIGHBOURS_PX))[out]
+    around = np.pad(np.where(clean, level, np.nan), NEIGHBOURS_PX // 2, constant_values=np.nan)
+    windows = sliding_window_view(around, (NEIGHBOURS_PX, NEIGHBOURS_PX))[out]
     ordered = np.sort(windows.reshape(len(windows), -1), axis=1)  # pixels that are not clean come last
     known = np.count_nonzero(np.isfinite(ordered), axis=1)
     places = (np.maximum(known - 1, 0) * quarter // 4 for quarter in (1, 2, 3))

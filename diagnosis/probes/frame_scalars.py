@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2, SeriesSummary
-from .few_quanta import enough_quanta
 from .fixed_pattern import Pattern
 from .lasting import LEAST_FRAMES
+from .noise_tails import enough_quanta
 from .probes import (
+    COUNT_SD,
     FIXED,
     FIXED_BLOCKS,
     FIXED_COLUMNS,
@@ -23,6 +24,7 @@ from .probes import (
     REPEATED_FRAMES,
     Scalar,
     noise_name,
+    root_of_count,
 )
 from .scalar_context import ScalarContext, afterglow_bins, time_templates
 
@@ -42,8 +44,8 @@ def measured_scalars(
     outliers: int | None,
     all_outliers: int,
     memory: tuple[float, int] | None,
-    copies: int = 0,
-    lasting: int = 0,
+    copies: int,
+    lasting: int,
 ) -> list[Scalar]:
     """The scalar probes of measured frames with their standard deviations (sampling and floor together).
 
@@ -68,19 +70,18 @@ def measured_scalars(
     if pattern is not None and not context.calibrates:
         found.fixed_pattern(pattern)
     if outliers is not None and not context.calibrates:
-        found.add("tails", OUTLIERS, "sqrt(pixels)", math.sqrt(outliers + 0.375), 0.5, "outliers")
+        found.add("tails", OUTLIERS, "sqrt(pixels)", root_of_count(outliers), COUNT_SD, "pixels")
         if memory is not None and memory[1] >= _LEAST_OUTLIERS and summary.frames >= _LEAST_FRAMES:
             share, count = memory
             sampling = math.sqrt(1.6 / (summary.frames * count))
             found.add("tails", "memory of outliers", "1", share, sampling, "memory of outliers")
     if context.repeatable:
-        # a line without fault repeats none: counts of variance 1/4, as if it might now and then
-        found.add("time", REPEATED_FRAMES, "sqrt(frames)", math.sqrt(copies + 0.375), 0.5, "repeated frames")
+        # a line without fault repeats none: counted as if it might now and then
+        found.add("time", REPEATED_FRAMES, "sqrt(frames)", root_of_count(copies), COUNT_SD, "repeated frames")
     if context.counts_all_outliers:
         if any(frames >= LEAST_FRAMES for frames, _ in context.later_darks):
-            found.add("tails", LASTING, "sqrt(pixels)", math.sqrt(lasting + 0.375), 0.5, "lasting pixels")
-        counted = math.sqrt(all_outliers + 0.375)
-        found.add("tails", OUTLIERS_ANYWHERE, "sqrt(pixels)", counted, 0.5, "outliers")
+            found.add("tails", LASTING, "sqrt(pixels)", root_of_count(lasting), COUNT_SD, "pixels")
+        found.add("tails", OUTLIERS_ANYWHERE, "sqrt(pixels)", root_of_count(all_outliers), COUNT_SD, "pixels")
     return found.scalars
 
 
@@ -180,18 +181,18 @@ class _Found:
             ("column_ratio", summary.column_variance_DN2, rows, columns),
         ):
             value = math.log(max(variance * count / total, 1e-12))
-            self.add("texture", name, "1", value, math.sqrt(3.0 / (freedom * lines)), name)
+            self.add("texture", name, "1", value, math.sqrt(3.0 / (freedom * lines)), "means")
         if summary.block_variance_DN2 > 0:
             value = math.log(summary.block_variance_DN2 * BLOCK_PX**2 / total)
             sampling = math.sqrt(2.5 / (freedom * self.n_good / BLOCK_PX**2))
-            self.add("texture", "block_ratio", "1", value, sampling, "block_ratio")
+            self.add("texture", "block_ratio", "1", value, sampling, "means")
         if frames > 5:
             shared = self.shared(*self.means_DN2)
             stack = float(np.mean(summary.stack_variance_DN2[context.good]))
             for step in (1, 2):
                 value = float(summary.temporal_covariance_DN2[step - 1]) / stack
                 sampling = math.sqrt(shared / (self.n_good * (frames - step)))
-                self.add("time", f"temporal_correlation {step}", "1", value, sampling, "temporal_correlation")
+                self.add("time", f"temporal_correlation {step}", "1", value, sampling, "correlation")
         if frames >= _KURTOSIS_FRAMES and enough_quanta(self.base, context.areas, summary):
             sampling = math.sqrt(40.0 / (self.n_good * freedom))
             self.add("tails", "kurtosis", "1", summary.kurtosis_excess, sampling, "kurtosis")

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.line.line_state import TelegraphPixels
+from ..session.even_maps import NEIGHBOURS_PX
 
 LEAST_FRAMES = 10  # below, levels that last and chance are too much alike
 BY_CHANCE = 1e-6  # of a quiet pixel: one in sixty panels of 128 x 128 pixels
 _NOISIER, _MEMORY_SD = 1e-4, 2.326  # chance of such a variance; standard deviations that one in a hundred passes
 _MOST = 0.15  # share of the pixels; more of them are a picture that fades, not pixels that jump
-_AROUND_PX, _MOST_AROUND = 5, 0.35  # the same of a square around one: of 10 % by chance one square in 500
+_MOST_AROUND = 0.35  # the same of the neighbours of one: of 10 % by chance one square in 500
 _DRAWN = 4000  # pixels of which chances are counted: 1 % of a share of one half
 _SEED = 0x7E1E
 OUTLYING = 8.0  # standard deviations of its mean from which a pixel stands out
@@ -59,7 +60,7 @@ def lasting_pixels(
     noisy = good & (stack_variance_DN2 > noisier * usual)
     lasts = pair_variance_DN2 < (1.0 - memory) * stack_variance_DN2
     found: NDArray[np.bool_] = noisy & lasts
-    around = uniform_filter(found.astype(np.float64), _AROUND_PX, mode="constant")
+    around = uniform_filter(found.astype(np.float64), NEIGHBOURS_PX, mode="constant")
     found &= around < _MOST_AROUND
     return found if np.count_nonzero(found) < _MOST * np.count_nonzero(good) else none
 

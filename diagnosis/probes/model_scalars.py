@@ -9,15 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
-from ...generator.line.rounding import variance_before_rounding
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
-from .few_quanta import tails_of_quanta
 from .fixed_pattern import Pattern, shares_of_pixels, shares_of_tiles
 from .lasting import BY_CHANCE, chance_in_flat, chances
 from .line_scalars import LineNoise, line_pattern
-from .lost_bits import rounded_kurtosis
 from .moving_picture import MovingPicture, lag_loss
 from .noise_correlation import autocovariance, correlation_sum
+from .noise_tails import tails_of_quanta, tails_of_rounding
 from .probes import (
     FIXED,
     FIXED_BLOCKS,
@@ -29,6 +27,7 @@ from .probes import (
     PATTERN_PIXEL_SHARE,
     REPEATED_FRAMES,
     noise_name,
+    root_of_count,
 )
 from .scalar_context import ScalarContext, afterglow_bins, frame_profile, time_templates
 
@@ -63,11 +62,11 @@ def expected_scalars(
     if not context.calibrates and context.kind in ("flat", "dark"):
         values |= _pattern_scalars(expected, context)
     if context.repeatable:
-        values[REPEATED_FRAMES] = math.sqrt(expected.repeated_share * context.repeatable + 0.375)
+        values[REPEATED_FRAMES] = root_of_count(expected.repeated_share * context.repeatable)
     if context.counts_all_outliers:
         lasting, _, out = _jumping(expected, context)
-        values[LASTING] = math.sqrt((lasting + BY_CHANCE) * areas.order.size + 0.375)
-        values[OUTLIERS_ANYWHERE] = math.sqrt((expected.bad_pixel_share + out) * areas.order.size + 0.375)
+        values[LASTING] = root_of_count((lasting + BY_CHANCE) * areas.order.size)
+        values[OUTLIERS_ANYWHERE] = root_of_count((expected.bad_pixel_share + out) * areas.order.size)
     return values
 
 
@@ -114,7 +113,7 @@ def _noise_scalars(expected: ExpectedSeries, context: ScalarContext, profile: ND
         correlation = float(temporal[step - 1]) if temporal.size >= step else 0.0
         values[f"temporal_correlation {step}"] = (correlation * mean_q + moving.lasting(step)) / full
     values["kurtosis"] = (
-        _kurtosis(expected, context, full) + moving.kurtosis(expected) + tails_of_quanta(expected, areas)
+        tails_of_rounding(expected, context, full) + moving.kurtosis(expected) + tails_of_quanta(expected, areas)
     )
     if context.kind in ("flat", "object"):
         quantum = (mean_q * keep * correlation_sum(expected, rows, columns) + mean_w) / areas.order.size
@@ -149,7 +148,7 @@ def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[s
     # about half of the hot ones are lost in a flat's light
     hot, bad = expected.hot_pixel_share, expected.bad_pixel_share
     seen = _jumping(expected, context)[1] + (hot if context.kind == "dark" else bad - 0.5 * hot)
-    values[OUTLIERS] = math.sqrt(seen * context.areas.order.size + 0.375)
+    values[OUTLIERS] = root_of_count(seen * context.areas.order.size)
     # what bad pixels add is new in every frame
     values["memory of outliers"] = 0.0
     return values
@@ -187,12 +186,3 @@ def _jumping(expected: ExpectedSeries, context: ScalarContext) -> tuple[float, f
 def _noise_names(label: str) -> tuple[str, tuple[str, ...]]:
     """Names of a label's variance and of its correlation at each of LAGS."""
     return noise_name(label), tuple(noise_name(label, lag) for lag in LAGS)
-
-
-def _kurtosis(expected: ExpectedSeries, context: ScalarContext, variance_DN2: float) -> float:
-    """Excess kurtosis that the ADC's steps leave in noise of a variance, rounding included."""
-    step, of_one = expected.quantisation_step_DN, context.averaged * variance_DN2
-    if step <= 0.0 or of_one > step**2:
-        return 0.0
-    before = float(variance_before_rounding(of_one, step))
-    return rounded_kurtosis(math.sqrt(before) / step, context.frames) / context.averaged

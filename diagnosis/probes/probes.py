@@ -7,6 +7,7 @@ others and bears the name of the template that it adds. *Scalar probes* are nois
 frames, lines, blocks, the common factor, codes, fixed pattern and outliers.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -17,14 +18,12 @@ REPEATED_FRAMES = "repeated frames"
 LASTING = "lasting pixels"
 ALONG_ROWS, ALONG_COLUMNS = "displacement along rows", "displacement along columns"  # of a scene
 PATTERN_PIXEL_SHARE = 0.9  # of a fixed pattern's variance that neighbours differ by
+COUNT_SD = 0.5  # of `root_of_count`
 # what repeats of the same measurement show beyond counting noise; standard deviations of the probe's own unit
 FLOORS: Mapping[str, float] = {
     "log_variance": 0.004,
-    "correlation": 0.002,
-    "row_ratio": 0.03,
-    "column_ratio": 0.03,
-    "block_ratio": 0.03,
-    "temporal_correlation": 0.002,
+    "correlation": 0.002,  # of neighbours, and of frames
+    "means": 0.03,  # over rows, columns and blocks
     "kurtosis": 0.02,
     "frame_factor": 0.15,
     "trend": 0.0002,  # two of the 16 octaves of an output with 1/f noise of 0.05 %
@@ -34,11 +33,18 @@ FLOORS: Mapping[str, float] = {
     "fixed_pattern": 0.025,  # of the value, as for its blocks
     "fixed_pattern blocks": 0.5,  # a pattern's grain is its own: white in the model, coarser in some panels
     "fixed_pattern lines": 0.1,
-    "outliers": 0.3,
+    "pixels": 0.3,  # that stand out, or whose level lasts
     "memory of outliers": 0.02,
-    "lasting pixels": 0.3,
     "repeated frames": 0.0,
 }
+
+
+def root_of_count(count: float) -> float:
+    """A count of rare events as a number whose standard deviation is COUNT_SD, whatever is expected.
+
+    Source: Anscombe (1948), doi:10.1093/biomet/35.3-4.246.
+    """
+    return math.sqrt(count + 0.375)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

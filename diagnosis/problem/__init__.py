@@ -11,5 +11,4 @@ Files:
     surroundings       light that effects bring in from beyond the borders
     line_noise         noise of rows and columns that is no effect
     output_course      levels and trends of a drifting output
-    known_effects      effects that the twin has already
 """

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ...generator.effects import AppliedEffect
 from ..model.changes import Change, Variant
-from ..model.curves import places_of
+from ..model.curves import LEAST_RESPONSE, places_of
 from ..model.forward_model import strength_rows
 from ..model.responses import Asked, SessionModel
 from ..session.even_maps import full_size
@@ -16,8 +16,6 @@ from .nuisance_columns import Columns, nuisances_of_series
 from .other_scenes import OtherScenes
 from .series_probes import SeriesProbes
 from .surroundings import border_inflow
-
-_LEAST_FACTOR = 1e-3  # standard deviations of a probe, below which a nuisance is none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,4 +123,4 @@ class AskedAgain:
 
 def notable(columns: Columns) -> Columns:
     """Nuisances (probe,) that any probe shows."""
-    return {name: column for name, column in columns.items() if float(np.max(np.abs(column))) > _LEAST_FACTOR}
+    return {name: column for name, column in columns.items() if float(np.max(np.abs(column))) > LEAST_RESPONSE}

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...acquisition.acquisition_io import AcquisitionFile, Series
 from ...acquisition.log_images import light_of_shares
 from ...errors import InputError
-from ...generator.effects import EFFECTS, AppliedEffect
+from ...generator.effects import EFFECTS, AppliedEffect, effect_of
 from ...generator.frames.conditions import beam_conditions, session_conditions, with_conditions
 from ...generator.line.twin import Twin
 from ..inference.discrepancy import FARTHEST_LEVEL, USUAL_LEVEL
@@ -40,7 +40,6 @@ from ..session.session import SessionSeries, only_own_noise, read_session
 from ..session.summaries import SeriesSummary
 from ..session.usable import SeenSeries, counted_copies, look_at_all, stated_series, summarise_all
 from .asked_again import AskedAgain, ProbedSeries, notable
-from .known_effects import lasting
 from .line_noise import usual_line_noise
 from .nuisance_columns import Columns, nuisances_of_series
 from .other_scenes import NO_SCENES, OtherScenes, other_scenes
@@ -53,6 +52,7 @@ _OWN_NOISE = "the flats are single frames: how much noise there is, is known onl
 # step in spectral parameters, over the posterior's standard deviation, about a point that the session wants
 _NEAR_A_POINT = 0.2
 _PLACES = "places of scenes"
+_IN_NO_LAW = ("output", "pixels", "lines", "offset")  # what effects do by chance to mean frames
 
 
 def build_problem(
@@ -91,7 +91,7 @@ def build_problem(
     requests = [item.request for item in session]
     variants = with_pauses(variants, stated=all(item.pause_stated for item in requests[1:]))
     conditions = session_conditions(requests, readout_ms=twin.instrument.readout_ms)
-    known = tuple(with_conditions(item, conditions) for item in lasting(twin.effects))
+    known = tuple(with_conditions(item, conditions) for item in known_by_law(twin.effects))
     base, cache = replace(smooth_twin(twin), effects=known), draft_cache()
     back: dict[str, float] = {}
     if spectral_point is not None and base.spectral is not None:
@@ -125,6 +125,11 @@ def build_problem(
         tell(f"responses of {one.name}")
         parts.append(compared.part(one))
     return _joined(parts, compared)
+
+
+def known_by_law(effects: Sequence[AppliedEffect]) -> tuple[AppliedEffect, ...]:
+    """Effects of a twin that are part of what is expected; others are sought again, and take the place of those it has."""
+    return tuple(item for item in effects if effect_of(item).variation.random not in _IN_NO_LAW)
 
 
 def _steps_in_twin(model: ForwardModel, *, spectral_steps: float, side: int) -> tuple[Change, ...]:

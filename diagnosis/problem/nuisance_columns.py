@@ -18,7 +18,7 @@ from ..model.forward_model import ForwardModel
 from ..model.point_maps import blurred_between_points, sampled_at_points
 from ..model.responses import Moved, SessionModel
 from ..probes.noise_correlation import correlation_sum
-from ..probes.probes import OUTLIERS, OUTLIERS_ANYWHERE, Scalar
+from ..probes.probes import OUTLIERS, OUTLIERS_ANYWHERE, Scalar, root_of_count
 from ..probes.registration import CELL_SD_PX, RENDER_SHARE, gradient
 from ..session.even_maps import Map
 from ..session.session import SessionSeries
@@ -116,8 +116,7 @@ def _of_beam(probes: SeriesProbes, beams_differ: float) -> Columns:
     for lag in LAGS:
         # the calibrated spread is one number; what it leaves open is the same in all series, or in those of a kV
         texture = _texture(probes, lag)
-        columns[f"texture {lag}"] = texture
-        columns[f"texture {lag} at {_voltage(item)}"] = scales.TEXTURE_OF_BEAM_SHARE * texture
+        columns[f"texture {lag}"] = columns[f"texture {lag} at {_voltage(item)}"] = texture
     return columns
 
 
@@ -174,9 +173,6 @@ def brighter(probes: SeriesProbes, signal: NDArray[np.float64]) -> NDArray[np.fl
 
 def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: float) -> _Images:
     """Level of beam and series, and gradient of the field."""
-    rows, columns = signal.shape
-    y = np.linspace(-1, 1, rows)[:, None] * np.ones((1, columns))
-    x = np.linspace(-1, 1, columns)[None, :] * np.ones((rows, 1))
     images: _Images = {
         f"level of {_beam(item)}": beams_differ * scales.LEVEL_OF_BEAM_SD * signal,
         f"level of {item.name}": scales.LEVEL_OF_SERIES_SD * signal,
@@ -191,8 +187,9 @@ def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: fl
             images[f"shape {number} since the calibration"] = changed
     if item.divided:
         images[f"open field of {item.name}"] = scales.DIVIDED_LEVEL_SD * signal
+        y, x = (np.linspace(-1.0, 1.0, length) for length in signal.shape)
         images[f"open field of {item.name}, x"] = scales.DIVIDED_TILT_SD * x * signal
-        images[f"open field of {item.name}, y"] = scales.DIVIDED_TILT_SD * y * signal
+        images[f"open field of {item.name}, y"] = scales.DIVIDED_TILT_SD * y[:, None] * signal
     return images
 
 
@@ -224,7 +221,7 @@ def _of_steps(probes: SeriesProbes, name: str) -> float:
 def _few_bad_pixels(probes: SeriesProbes) -> NDArray[np.float64]:
     """Half of the few pixels that may turn bad without that being an effect, as counts of outliers show them."""
     few = 0.5 * max(scales.FEW_BAD_PIXELS, scales.FEW_BAD_SHARE * probes.series.context.areas.order.size)
-    more = math.sqrt(few + 0.375) - math.sqrt(0.375)
+    more = root_of_count(few) - root_of_count(0)
     return probes.of_scalars(lambda probe: more if probe.name in (OUTLIERS, OUTLIERS_ANYWHERE) else 0.0)
 
 

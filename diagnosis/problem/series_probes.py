@@ -21,10 +21,8 @@ from ..probes.map_probes import MapProjection, Template, edge_templates, smooth_
 from ..probes.probes import ProbeName, Scalar
 from ..probes.registration import RENDER_SHARE, render_variance
 from ..probes.straight_edge import covered_scene, distance_px, scatter_share
-from ..session.even_maps import Map, full_size, local_range, near_steps, signal_map
+from ..session.even_maps import NEIGHBOURS_PX, Map, full_size, local_range, near_steps, signal_map
 from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
-
-_NEIGHBOURS_PX = 5  # side of the squares whose mean says how much light is there
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -183,7 +181,7 @@ def variance_of_what_came(
     """
     from scipy.ndimage import uniform_filter
 
-    seen = uniform_filter(np.asarray(corrected_DN, dtype=np.float64), _NEIGHBOURS_PX)
+    seen = uniform_filter(np.asarray(corrected_DN, dtype=np.float64), NEIGHBOURS_PX)
     return np.asarray(seen * float(variance_DN2.sum()) / max(float(signal_DN.sum()), 1e-9))
 
 

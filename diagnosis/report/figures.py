@@ -13,8 +13,10 @@ from ...reports.chart import SERIES_COLOURS, SHAPES, Shape, asinh_ticks, rows_px
 from ..inference.inference import title_of
 from ..judgement.answer import Diagnosis
 from ..problem.problem import SeriesView
+from ..session.even_maps import NEIGHBOURS_PX
 from .words import axis_text, statistic_text
 
+_MAPS = 4  # series whose maps are drawn
 # of -log transmission, evenly up to 2 and by its logarithm beyond
 _DEPTH_TICKS = (0.0, 0.5, 1.0, 2.0, 5.0, 10.0)
 _EVEN_DEPTH, _EVEN_Z = 2.0, 5.0
@@ -23,19 +25,21 @@ _MOST_HYPOTHESES, _LEAST_PROBABILITY = 6, 1e-4
 
 
 def _smoothed_z(view: SeriesView, residual: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Residual over noise after averaging over 5 x 5 pixels (row, column)."""
+    """Residual over noise after averaging over neighbours (row, column)."""
     from scipy.ndimage import uniform_filter
 
     inside = view.mask.astype(np.float64)
-    weight = uniform_filter(inside, 5)
-    value = uniform_filter(np.where(view.mask, residual, 0.0).astype(np.float64), 5) / np.maximum(weight, 1e-9)
-    noise = uniform_filter(np.where(view.mask, view.noise_DN, 0.0).astype(np.float64) ** 2, 5) / np.maximum(
-        weight, 1e-9
-    )
+    weight = uniform_filter(inside, NEIGHBOURS_PX)
+
+    def smoothed(image: NDArray[np.floating]) -> NDArray[np.float64]:
+        kept = np.where(view.mask, image, 0.0).astype(np.float64)
+        return np.asarray(uniform_filter(kept, NEIGHBOURS_PX) / np.maximum(weight, 1e-9))
+
+    value, noise = smoothed(residual), smoothed(np.asarray(view.noise_DN, dtype=np.float64) ** 2)
     return np.asarray(np.where(weight > 0.2, value / np.sqrt(np.maximum(noise, 1e-30)), np.nan))
 
 
-def gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], *, count: int = 4) -> list[Picture]:
+def gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]]) -> list[Picture]:
     """Residual mean frames in units of one pixel's noise, 5 x 5 average: before and after.
 
     Series of which the effects take most away come first; where there are none, those with most gap.
@@ -43,11 +47,10 @@ def gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], *, cou
     Args:
         diagnosis: with what was compared.
         after: (series) residuals (row, column) with the effects added, DN.
-        count: of series.
     """
     views = diagnosis.compared.views
     pictures = []
-    for index in _telling_views(diagnosis, after, count):
+    for index in _telling_views(diagnosis, after):
         view = views[index]
         before = _smoothed_z(view, view.residual_DN)
         limit = max(3.0, float(np.nanquantile(np.abs(before), 0.98)))
@@ -69,7 +72,7 @@ def gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], *, cou
     return pictures
 
 
-def _telling_views(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], count: int) -> list[int]:
+def _telling_views(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]]) -> list[int]:
     """Views with the most to show, one a kind, scene and voltage: what is taken of the gap, or the gap where that is nothing."""
     problem = diagnosis.compared
     power, taken = np.zeros(len(problem.views)), np.zeros(len(problem.views))
@@ -92,7 +95,7 @@ def _telling_views(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], 
             continue
         seen.add(key)
         result.append(int(index))
-        if len(result) == count:
+        if len(result) == _MAPS:
             break
     return result
 

@@ -19,8 +19,6 @@ from .explanation import compared_text, headline, lead_text, strained_text, verd
 from .figures import gap_maps, held_out_chart, hypotheses_chart, places_chart, transmission_curves
 from .words import axis_text, location_text, share_text, statistic_text, strength_text, when_text
 
-_MAPS = 4  # series whose maps are drawn
-
 
 def residuals_after(diagnosis: Diagnosis) -> list[NDArray[np.float32]]:
     """Residual maps of each series with the leading hypothesis' effects added, DN; of the squares that were compared."""
@@ -64,7 +62,7 @@ def write_report(
         interactive: figures that answer to the pointer; None: where Bokeh is installed.
     """
     after = residuals_after(diagnosis)
-    maps = gap_maps(diagnosis, after, count=_MAPS)
+    maps = gap_maps(diagnosis, after)
     first = 2 if diagnosis.added else 1  # of the series with most gap
     groups: dict[str, list[Figure]] = {
         "map": [*maps],

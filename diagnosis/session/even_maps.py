@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
 
-_STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
+NEIGHBOURS_PX = 5  # side of the square that a pixel's neighbours are in
+_STEP_SHARE = 0.12  # of the brighter side, among neighbours: more is a step
 
 Map = NDArray[np.float32]
 NOWHERE: Map = np.zeros((1, 1), np.float32)
@@ -47,9 +48,9 @@ def local_range(signal_DN: NDArray[np.floating], reach: int = 1) -> NDArray[np.f
 
 
 def near_steps(signal: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Pixels within two of a step in a signal (row, column)."""
+    """Pixels with a step of a signal (row, column) among their neighbours."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    highest, lowest = maximum_filter(signal, 5), minimum_filter(signal, 5)
+    highest, lowest = maximum_filter(signal, NEIGHBOURS_PX), minimum_filter(signal, NEIGHBOURS_PX)
     steps: NDArray[np.bool_] = (highest - lowest) > _STEP_SHARE * np.maximum(highest, 1e-9)
     return steps

@@ -133,7 +133,7 @@ def session_features(problem: "Problem") -> dict[str, float]:
         beam = (
             "" if not _lit(view) or not voltages else f"kV{voltages.index(series.kV)}" if series.kV in voltages else ""
         )
-        after = "after" if view.session.after else "before"
+        after = "after" if view.session.request.after_calibration else "before"
         statistic = re.sub(r"[\d.]+", "#", name.statistic)
         families.setdefault("|".join((name.axis, series.kind, scene, beam, after, statistic)), []).append(
             float(z[index])

@@ -6,7 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from raytwin.diagnosis.inference.inference import Hypothesis
 from raytwin.diagnosis.judgement import strengths
+from raytwin.diagnosis.model.changes import Variant
+from raytwin.diagnosis.model.curves import Curve
 from raytwin.generator.effects import AppliedEffect
 
 SHAPE, FRAMES, SIGNAL_DN = (24, 24), 20, 5000.0
@@ -28,14 +31,21 @@ def view(output, *, signal_DN=SIGNAL_DN, noise_DN=5.0, lit=True, calibrates=Fals
     )
 
 
+def hypothesis(effects, *, strength=1.0, since="always"):
+    """Effects at a strength, whose responses nothing reads."""
+    variants = [Variant(effect=name, low=0.1, high=10.0, strengths=(1.0,), since=since) for name in effects]
+    return Hypothesis(
+        effects=effects,
+        probability=1.0,
+        log_evidence=0.0,
+        strengths=dict.fromkeys(effects, (strength, 0.9 * strength, 1.1 * strength)),
+        variants={one.effect: Curve(variant=one, responses=np.zeros((1, 1))) for one in variants},
+    )
+
+
 def found(views, *, effects=("output_drift",), since="always"):
     problem = SimpleNamespace(views=views)
-    hypothesis = SimpleNamespace(
-        effects=effects,
-        variants={name: SimpleNamespace(variant=SimpleNamespace(since=since)) for name in effects},
-        strengths=dict.fromkeys(effects, (1.0, 0.9, 1.1)),
-    )
-    return strengths._output_rms(problem, hypothesis, "output_drift")
+    return strengths._output_rms(problem, hypothesis(effects, since=since), "output_drift")
 
 
 def lit_series(**more):
@@ -71,7 +81,7 @@ def test_a_drift_since_the_calibration_is_read_from_later_series():
 
 
 def test_what_another_effect_does_to_levels_is_taken_off_and_much_of_it_left_out(monkeypatch):
-    monkeypatch.setattr(strengths, "_applied", lambda problem, hypothesis, effect, strength: effect)
+    monkeypatch.setattr(strengths, "_applied", lambda problem, point: point.effect)
     shares = [0.004, -0.006, 0.0, 0.5, 0.0, 0.003, 0.0, -0.3]
     views = [view(part, more=share) for part, share in zip(np.split(OUTPUT, 8), shares, strict=True)]
     changes = [np.full((1, 1), share * SIGNAL_DN) for share in shares]
@@ -111,8 +121,7 @@ def flats(change, *, noise=0.002, expected=None, count=3, seed=0):
 
 
 def map_rms(views, *, effects=("gain_map_error",)):
-    hypothesis = SimpleNamespace(effects=effects, strengths=dict.fromkeys(effects, (1.0, 0.9, 1.1)))
-    return strengths._map_rms(SimpleNamespace(views=views), hypothesis, "gain_map_error")
+    return strengths._map_rms(SimpleNamespace(views=views), hypothesis(effects), "gain_map_error")
 
 
 @pytest.mark.parametrize("pattern", ["pixels", "stripes", "smooth", "all"])
@@ -174,8 +183,8 @@ def test_a_drifting_dark_is_read_off_the_last_one_of_the_longest_exposure(monkey
     moved = {"dark_drift": [0.0, 2.5, 5.0, 1.25], "image_lag": [0.0, 0.0, 2.0, 0.0]}
     early = {10.0: 0.0, 0.1: 0.0}  # share of the drift by the calibrating darks, by the law's course
 
-    def applied(problem, hypothesis, effect, strength):
-        return AppliedEffect(id=effect, parameters={"strength": strength}, since="always")
+    def applied(problem, point):
+        return AppliedEffect(id=point.effect, parameters={"strength": point.strength}, since="always")
 
     def changes(problem, effects):
         share = 1.0 - early.get(effects[0].parameters.get("warm_up"), 0.0)
@@ -185,8 +194,7 @@ def test_a_drifting_dark_is_read_off_the_last_one_of_the_longest_exposure(monkey
     monkeypatch.setattr(strengths, "map_changes", changes)
 
     def read(views, *effects):
-        hypothesis = SimpleNamespace(effects=effects, strengths=dict.fromkeys(effects, (5.0, 1.0, 9.0)))
-        return strengths._last_dark(SimpleNamespace(views=views), hypothesis, "dark_drift")
+        return strengths._last_dark(SimpleNamespace(views=views), hypothesis(effects, strength=5.0), "dark_drift")
 
     darks = [dark(0.0, 0.0, calibrates=True), dark(100.0, 7.0), dark(200.0, 12.0), dark(300.0, 9.0, exposure_ms=25.0)]
     value, low, high = read(darks, "dark_drift")

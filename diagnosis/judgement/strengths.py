@@ -68,7 +68,7 @@ def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[
         found = _last_dark(problem, hypothesis, effect)
     if found is None and (reading.map_rms or reading.last_dark):
         read_sd = None  # single pixels, or other series, alone tell it
-    if found is None and reading.sd is not None and curve.exact is not None and bool(curve.exact.any()):
+    if found is None and reading.sd is not None:
         found = _outright(problem, hypothesis, effect)
     value, low, high = hypothesis.strengths[effect] if found is None else found
     # what the session shows the law to be off by, where that is more than usual
@@ -92,7 +92,9 @@ def _off_by(problem: Problem, curve: Curve, strength: float, level: float) -> fl
 def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:
     """The strength at which the probes that define it have their measured values, and its 95 % interval; None: at none."""
     curve = hypothesis.variants[effect]
-    exact = np.zeros(len(problem.residual), dtype=bool) if curve.exact is None else curve.exact
+    exact = curve.exact
+    if exact is None or not exact.any():
+        return None
     left = problem.left_by(hypothesis.points(but=effect), without=[effect])[exact]
     lowest, highest = curve.reach
     if len(curve.strengths) > 1:

@@ -118,7 +118,7 @@ def _places(kept: Sequence[SessionSeries]) -> dict[tuple[str, float], list[Sessi
     places: dict[tuple[str, float], list[SessionSeries]] = {}
     for item in kept:
         if item.series.kind == "object":
-            places.setdefault((item.series.scene, item.request.source_object_mm or 0.0), []).append(item)
+            places.setdefault(item.place, []).append(item)
     return places
 
 

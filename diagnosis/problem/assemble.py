@@ -1,7 +1,8 @@
 """Session and twin -> the problem that inference solves: residual probes, nuisance factors, responses to every effect."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +49,7 @@ from .series_block import SeriesBlock, by_chance, jitter_of, series_block
 from .series_probes import MeanFrame, mean_frame, series_probes
 from .surroundings import border_inflow
 
+_Key = TypeVar("_Key", bound=Hashable)
 _OWN_NOISE = "the flats are single frames: how much noise there is, is known only from these same series"
 # step in spectral parameters, over the posterior's standard deviation, about a point that the session wants
 _NEAR_A_POINT = 0.2
@@ -372,7 +374,9 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
             for axis, series in of_probes
         ]
     )
-    sharing, _ = _numbered([_shares_nuisances(block.session) for block in blocks])
+    # series of one place share local nuisances
+    shown = [block.session for block in blocks]
+    sharing, _ = _numbered([item.place if item.series.kind == "object" else item.name for item in shown])
     residual = np.concatenate([block.residual for block in blocks])
     for name, step in compared.back.items():
         residual -= step * factors.get(name, 0.0)
@@ -441,17 +445,10 @@ def _families(names: Sequence[ProbeName], series: Sequence[Series]) -> Families:
     return Families(of=of, names=found, exact=frozenset(number for number, name in enumerate(found) if name in exact))
 
 
-def _numbered(keys: Sequence[str]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
+def _numbered(keys: Sequence[_Key]) -> tuple[NDArray[np.intp], tuple[_Key, ...]]:
     """Number of each key (key,), in the order in which they first occur, and the keys by number."""
     numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     return np.array([numbers[key] for key in keys], dtype=np.intp), tuple(numbers)
-
-
-def _shares_nuisances(item: SessionSeries) -> str:
-    """What series that share local nuisances have in common."""
-    if item.series.kind != "object":
-        return f"series {item.name}"
-    return f"scene {item.series.scene} at {item.request.source_object_mm or 0.0!r}"
 
 
 def _factors(blocks: Sequence[SeriesBlock], responses: NDArray[np.float64], compared: _Compared) -> Columns:

@@ -14,7 +14,6 @@ from ...calibration.flats.setting_errors import EXPOSURE_SD_MS
 from ...generator.frames.declared_spot import declared_spot_px
 from ...generator.line.line_state import FixedPattern, TilePattern
 from ..model import changes as scales
-from ..model.forward_model import ForwardModel
 from ..model.point_maps import blurred_between_points, sampled_at_points
 from ..model.responses import Moved, SessionModel
 from ..probes.noise_correlation import correlation_sum
@@ -42,12 +41,7 @@ def nuisances_of_series(
         signal: expected (row, column), DN.
         redrawn: what other scenes would show.
     """
-    columns = _of_its_own(session.model, probes, signal, redrawn) | _gain_map_noise(session, probes, signal)
-    return {name: column * probes.shrink for name, column in columns.items()}
-
-
-def _of_its_own(model: ForwardModel, probes: SeriesProbes, signal: NDArray[np.float64], redrawn: Redrawn) -> Columns:
-    item, beams_differ = probes.series.session, model.beams_differ
+    item, model, beams_differ = probes.series.session, session.model, session.model.beams_differ
     columns: Columns = {
         "shape of the noise": probes.of_scalars(lambda probe: scales.KURTOSIS_SD if probe.name == "kurtosis" else 0.0)
     }
@@ -68,13 +62,9 @@ def _of_its_own(model: ForwardModel, probes: SeriesProbes, signal: NDArray[np.fl
             images |= _between_points(item, signal)
         if redrawn.covered is not None:
             images[f"border of {_place(item)}"] = redrawn.covered
-    return columns | _projected(probes, images)
-
-
-def _projected(probes: SeriesProbes, images: Mapping[str, NDArray[np.floating]]) -> Columns:
-    """Responses to changes of the mean frame (row, column), DN, by the same names."""
-    found = probes.of_maps(np.stack(list(images.values())).astype(np.float32))
-    return dict(zip(images, found, strict=True))
+    columns |= zip(images, probes.of_maps(np.stack(list(images.values())).astype(np.float32)), strict=True)
+    columns |= _gain_map_noise(session, probes, signal)
+    return {name: column * probes.shrink for name, column in columns.items()}
 
 
 def _voltage(item: SessionSeries) -> str:
@@ -400,7 +390,7 @@ def noise_of_lines(probes: SeriesProbes) -> NDArray[np.float64]:
     """Variance (2, probe) that noise of 1 DN, new in every exposure and common to rows (to columns), leaves in a mean frame."""
     request = probes.series.session.request
     variance = probes.projection.line_noise() / (request.frames * request.exposures_per_frame)
-    return np.pad(variance, ((0, 0), (0, len(probes) - variance.shape[1])))
+    return probes.without_scalars(variance)
 
 
 @lru_cache(maxsize=1)

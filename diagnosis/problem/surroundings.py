@@ -27,8 +27,7 @@ def border_inflow(
     if EFFECTS[effect.id].variation.random != "surroundings":
         return None
     columns = [_of_series(session, probes, effect) for probes in series]
-    stated = [probes.series.session for probes in series]
-    of = [(item.series.scene, item.request.source_object_mm) for item in stated]
+    of = [probes.series.session.place for probes in series]
     places = dict.fromkeys(place for place, column in zip(of, columns, strict=True) if column.any())
     if not places:
         return None

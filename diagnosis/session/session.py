@@ -42,6 +42,11 @@ class SessionSeries:
         """The series' name."""
         return self.series.name
 
+    @property
+    def place(self) -> tuple[str, float]:
+        """Its scene, and how far from the source that stood, mm (0: not stated): series of one place show the same picture."""
+        return self.series.scene, self.request.source_object_mm or 0.0
+
 
 def only_own_noise(session: Sequence[SessionSeries]) -> bool:
     """Whether no flat that calibrates has noise, so that the twin has it from series after them."""

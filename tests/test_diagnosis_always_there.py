@@ -33,7 +33,7 @@ def usual_of(summary):
     series = SimpleNamespace(kind="dark")
     item = SimpleNamespace(name="dark", series=series, calibrates=True, request=SimpleNamespace(exposures_per_frame=1))
     model = SimpleNamespace(row_variance_DN2=0.0, column_variance_DN2=0.0)
-    return usual_line_noise([item], {"dark": model}, {"dark": summary}, ALL)
+    return usual_line_noise([SimpleNamespace(name="dark", session=item, expected=model)], {"dark": summary}, ALL)
 
 
 def test_noise_of_lines_is_found_up_to_what_is_no_effect():
@@ -91,7 +91,7 @@ def test_dust_on_a_flat_is_left_out_and_makes_no_bad_pixel():
     picture[50, 70] *= 0.9
     series = SimpleNamespace(kind="flat", exposure_ms=100.0, corrected=frozenset())
     item = SimpleNamespace(name="flat", series=series, request=SimpleNamespace(beam_on=True), calibrates=False)
-    looks = {"flat": SimpleNamespace(frames=9, mean_DN=picture, pair_variance_DN2=np.full(SHAPE, 900.0))}
+    look = SimpleNamespace(frames=9, mean_DN=picture, pair_variance_DN2=np.full(SHAPE, 900.0))
     maps = CalibratedMaps(
         darks=SimpleNamespace(under=lambda item: np.zeros(SHAPE)),
         gain=np.ones(SHAPE),
@@ -102,8 +102,8 @@ def test_dust_on_a_flat_is_left_out_and_makes_no_bad_pixel():
         gain_white=0.0,
         good=ALL,
     )
-    expected = {"flat": SimpleNamespace(signal_DN=np.full(SHAPE, signal))}
-    found = new_outliers([item], expected, looks, maps)
+    expected = SimpleNamespace(signal_DN=np.full(SHAPE, signal))
+    found = new_outliers([SimpleNamespace(session=item, expected=expected, look=look)], maps)
     assert [tuple(place) for place in np.argwhere(found.bad)] == [(50, 70)]
     assert found.any[20:23, 40:43].all() and np.count_nonzero(found.any) == 10
 

@@ -174,7 +174,7 @@ def test_pixels_that_stand_out_before_every_object_are_the_panels_own(divided):
     signal = np.full(SHAPE, 3000.0)
     gain = rng.uniform(0.5, 1.5, SHAPE)  # of pixels; frames that were divided by it show nothing of it
     dead, hot = (20, 30), (50, 90)
-    kept, looks, expected = [], {}, {}
+    seen = []
     for number in range(5):
         scene = signal.copy()
         scene[:, 10 + 20 * number :] *= 0.4  # each product's outline lies elsewhere, and is drawn a pixel off
@@ -193,9 +193,13 @@ def test_pixels_that_stand_out_before_every_object_are_the_panels_own(divided):
                 corrected=frozenset(("offset", "gain") if divided else ()),
             )
             request = SimpleNamespace(beam_on=True)
-            kept.append(SimpleNamespace(name=name, series=series, request=request, calibrates=False))
-            looks[name] = SimpleNamespace(mean_DN=picture if divided else picture * gain)
-            expected[name] = SimpleNamespace(signal_DN=drawn)
+            seen.append(
+                SimpleNamespace(
+                    session=SimpleNamespace(name=name, series=series, request=request, calibrates=False),
+                    look=SimpleNamespace(mean_DN=picture if divided else picture * gain),
+                    expected=SimpleNamespace(signal_DN=drawn),
+                )
+            )
     maps = CalibratedMaps(
         darks=SimpleNamespace(under=lambda item: np.zeros(SHAPE)),
         gain=gain,
@@ -206,9 +210,9 @@ def test_pixels_that_stand_out_before_every_object_are_the_panels_own(divided):
         gain_white=0.0,
         good=ALL,
     )
-    assert [tuple(place) for place in np.argwhere(new_outliers(kept, expected, looks, maps).bad)] == [dead, hot]
+    assert [tuple(place) for place in np.argwhere(new_outliers(seen, maps).bad)] == [dead, hot]
     # three products are too few to tell a defect from what they have in common
-    assert not new_outliers(kept[:6], expected, looks, maps).any.any()
+    assert not new_outliers(seen[:6], maps).any.any()
 
 
 def test_noise_that_a_line_has_in_common_makes_no_pixel_of_it_stand_out():
@@ -220,8 +224,9 @@ def test_noise_that_a_line_has_in_common_makes_no_pixel_of_it_stand_out():
     pairs = np.mean(np.diff(frames, axis=0) ** 2, axis=0) / 2.0
     dark = SimpleNamespace(kind="dark", exposure_ms=100.0, corrected=frozenset())
     item = SimpleNamespace(name="dark", series=dark, request=SimpleNamespace(beam_on=False), calibrates=False)
-    looks = {"dark": SimpleNamespace(frames=12, mean_DN=np.full(SHAPE, 100.0), pair_variance_DN2=pairs)}
-    looks["dark"].mean_DN += rng.standard_normal(SHAPE)
+    look = SimpleNamespace(
+        frames=12, mean_DN=np.full(SHAPE, 100.0) + rng.standard_normal(SHAPE), pair_variance_DN2=pairs
+    )
     maps = CalibratedMaps(
         darks=SimpleNamespace(under=lambda item: np.full(SHAPE, 100.0)),
         gain=np.ones(SHAPE),
@@ -232,5 +237,6 @@ def test_noise_that_a_line_has_in_common_makes_no_pixel_of_it_stand_out():
         gain_white=0.0,
         good=ALL,
     )
+    seen = SimpleNamespace(session=item, look=look)
     assert np.median(pairs[44]) > 8.0 * np.median(pairs)
-    assert [tuple(place) for place in np.argwhere(new_outliers([item], {}, looks, maps).bad)] == [noisy]
+    assert [tuple(place) for place in np.argwhere(new_outliers([seen], maps).bad)] == [noisy]

@@ -61,12 +61,18 @@ def twin(dark_DN=7.0):
 
 def maps_of(kept, means_DN, expected, copies=MappingProxyType({})):
     """Dark and gain map; copies: frames of a series that are copies of others, by name."""
-    looks = {
-        item.name: SimpleNamespace(mean_DN=means_DN[item.name], frames=item.series.n_frames - copies.get(item.name, 0))
+    seen = [
+        SimpleNamespace(
+            name=item.name,
+            session=item,
+            expected=expected.get(item.name, expectation(1000.0)),
+            look=SimpleNamespace(
+                mean_DN=means_DN.get(item.name), frames=item.series.n_frames - copies.get(item.name, 0)
+            ),
+        )
         for item in kept
-        if item.name in means_DN
-    }
-    return calibrated_maps(kept, expected, looks, twin=twin(), good=GOOD)
+    ]
+    return calibrated_maps(seen, twin=twin(), good=GOOD)
 
 
 def test_another_spread_that_calibration_leaves_open_is_a_nuisance_as_large_as_it_is_probable():

@@ -128,12 +128,20 @@ def test_too_few_pixels_say_nothing():
 
 
 @dataclass(frozen=True)
+class Asked:
+    """What placing reads of a series that is asked for."""
+
+    request: SeriesRequest
+    series: SimpleNamespace
+
+
+@dataclass(frozen=True)
 class Item:
     """What placing reads of a series."""
 
     name: str
-    request: SeriesRequest
-    series: SimpleNamespace
+    session: Asked
+    expected: SimpleNamespace
 
 
 def drawn(request):
@@ -152,10 +160,10 @@ def test_a_border_is_drawn_as_it_shows(stated, rays):
     )
     truth = drawn(replace(asked, thickness_mm={"Pb": edge(0.06, rays=rays)})).signal_DN
     seen = truth + np.random.default_rng(4).normal(0.0, np.sqrt(truth / 10.0))
-    items = [Item("edge", asked, SimpleNamespace(n_frames=10))]
+    items = [Item("edge", Asked(asked, SimpleNamespace(n_frames=10)), drawn(asked))]
     measured = MeasuredScenes(pictures={"edge": seen}, clean=np.ones(SHAPE, bool), sharp=False, expect=drawn)
-    members, placement = _as_drawn(items, {"edge": drawn(asked)}, measured)
-    left = np.abs(members[0].request.thickness_mm["Pb"] - edge(0.06, rays=rays)).max()
+    members, placement = _as_drawn(items, measured)
+    left = np.abs(members[0].session.request.thickness_mm["Pb"] - edge(0.06, rays=rays)).max()
     assert left < 0.12
     assert (members is items) == (rays == stated)
     assert math.hypot(placement.row_px * 0.06, placement.column_px) < 0.05

@@ -334,7 +334,7 @@ def _projection(rng, shape=(24, 20), templates=6, products=1):
 def test_map_probes_have_unit_noise_and_do_not_depend_on_each_other(products):
     projection, mask, quantum, white, table = _projection(np.random.default_rng(4), products=products)
     assert np.linalg.matrix_rank(table) == products
-    assert [name.location for name in projection.names()] == [str(number) for number in range(6)]
+    assert [name.location for name in projection.names] == [str(number) for number in range(6)]
     rows, columns = mask.shape
     y, x = (index.ravel() for index in np.indices(mask.shape))
     apart = np.abs(y[:, None] - y[None, :]), np.abs(x[:, None] - x[None, :])
@@ -555,12 +555,16 @@ def test_copies_are_counted_once_for_the_series_that_calibrate_and_once_for_all_
         return SimpleNamespace(copies=copies, stack_variance_DN2=np.full((2, 2), noise))
 
     looks = {"dark": look(2), "flat": look(1), "later": look(3), "blank": look(4, noise=0.0)}
-    kept = tuple(
-        SimpleNamespace(name=name, calibrates=name in ("dark", "flat"), series=SimpleNamespace(n_frames=11))
-        for name in looks
-    )
+    seen = [
+        SimpleNamespace(
+            name=name,
+            session=SimpleNamespace(calibrates=name in ("dark", "flat"), series=SimpleNamespace(n_frames=11)),
+            look=one,
+        )
+        for name, one in looks.items()
+    ]
     # frames that are all alike can be copies or not: nothing tells
-    assert counted_copies(kept, looks) == {"flat": (3, 20), "later": (3, 10)}
+    assert counted_copies(seen) == {"flat": (3, 20), "later": (3, 10)}
 
 
 def test_between_the_strengths_that_are_asked_copies_are_foretold_within_their_chance():

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from ..model.curves import Curve
+from ..model.curves import Curve, places_of
 from .discrepancy import LEAST_MOVED, LEVELS, Levels, only
 from .observed import Observed, Point
 
@@ -178,10 +178,9 @@ class _Terms:
         parts = [np.concatenate([curve.responses, _chance_of(curve)]) for curve in curves]
         vectors = np.concatenate([observed.residual[None, :], *parts])
         taken_up = observed.nuisances.project(vectors)
-        ends = np.cumsum([1, *map(len, parts)])
         found = []
-        for curve, start, end in zip(curves, ends[:-1], ends[1:], strict=True):
-            own, left = vectors[start:end], taken_up[start:end]
+        for curve, place in zip(curves, places_of([vectors[:1], *parts])[1:], strict=True):
+            own, left = vectors[place], taken_up[place]
             of_residual = own @ vectors[0] - left @ taken_up[0]
             found.append(cls(curve, own @ own.T - left @ left.T, of_residual))
         return found
@@ -241,10 +240,8 @@ def _off_by(observed: Observed, curve: Curve, exact: _Likelihood, level: float, 
 
 def _chance_of(curve: Curve) -> NDArray[np.float64]:
     """What a curve does by chance a unit of strength (factor, probe); what moves nothing that shows is left out."""
-    if curve.spread is None:
-        return np.zeros((0, curve.responses.shape[1]))
-    shows = np.max(np.abs(curve.spread), axis=0, initial=0.0) * curve.reach[1] >= LEAST_MOVED
-    return np.asarray(curve.spread[:, shows].T)
+    shows = np.max(np.abs(curve.chance), axis=0, initial=0.0) * curve.reach[1] >= LEAST_MOVED
+    return np.asarray(curve.chance[:, shows].T)
 
 
 def refined(strengths: NDArray[np.float64], best: float, width: float) -> NDArray[np.float64]:

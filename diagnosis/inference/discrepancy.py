@@ -124,8 +124,8 @@ def law_factors(
     """What is random about an effect at a strength: its law's inaccuracy, and, with `chance`, its own spread."""
     if curve.exact is not None:
         response = np.where(curve.exact, 0.0, response)
-    spread = curve.spread if chance else None
-    if spread is None or float(np.max(np.abs(spread), initial=0.0)) * strength < LEAST_MOVED:
+    spread = curve.chance
+    if not chance or float(np.max(np.abs(spread), initial=0.0)) * strength < LEAST_MOVED:
         spread = np.zeros((len(response), 0))
     moves = float(np.max(np.abs(response), initial=0.0)) * level >= LEAST_MOVED
     return LawFactors(group_factors(response, groups, level if moves else 0.0), spread * strength)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, vstack
 
-from ..model.curves import Curve
+from ..model.curves import Curve, places_of
 
 
 class Nuisances:
@@ -158,13 +158,13 @@ class Whitening:
         """Curves with their responses whitened."""
         if not curves:
             return ()
-        whole = self.apply(np.concatenate([curve.responses for curve in curves]))
-        ends = np.cumsum([len(curve.responses) for curve in curves])
+        each = [curve.responses for curve in curves]
+        whole = self.apply(np.concatenate(each))
         result = []
-        for curve, responses in zip(curves, np.split(whole, ends[:-1]), strict=True):
+        for curve, place in zip(curves, places_of(each), strict=True):
             spread = None if curve.spread is None else np.ascontiguousarray(self.apply(curve.spread.T).T)
             jitter = None if curve.jitter is None else self.variances(curve.jitter)
-            result.append(replace(curve, responses=responses, spread=spread, jitter=jitter))
+            result.append(replace(curve, responses=whole[place], spread=spread, jitter=jitter))
         return tuple(result)
 
 

@@ -216,8 +216,7 @@ class Observed:
     @staticmethod
     def _moved(curve: Curve, strength: float) -> NDArray[np.float64]:
         """Rows (1 + chance, probe): what a curve's law does at a strength, and what it does by chance."""
-        moved = curve.response(strength)[None, :]
-        return moved if curve.spread is None else np.concatenate([moved, strength * curve.spread.T])
+        return np.concatenate([curve.response(strength)[None, :], strength * curve.chance.T])
 
 
 def slope(curve: Curve, strength: float) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ...checks.findings import NOT_OF_LABELS, Finding
@@ -125,9 +126,9 @@ class Diagnosis(Result):
             )
         return self.problem
 
-    def __reduce__(self) -> tuple[Any, tuple[dict[str, Any]]]:
+    def __reduce__(self) -> tuple[Any, tuple[()]]:
         values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return _diagnosis_from_fields, ({**values, "problem": None},)
+        return partial(Diagnosis, **{**values, "problem": None}), ()
 
     def to_dict(self) -> dict[str, Any]:
         """What `raytwin diagnose --json` prints, the contents of diagnosis.json."""
@@ -186,10 +187,6 @@ class Diagnosis(Result):
         title = f"{self.verdict}: gap {gap.before:.3g} before, {gap.after:.3g} after, floor {gap.floor:.3g}"
         header = ("effect", "probability", "strength (95 %)", "since") if rows else ()
         return Table(title=title, header=header, rows=tuple(rows), notes=tuple(notes))
-
-
-def _diagnosis_from_fields(values: dict[str, Any]) -> Diagnosis:
-    return Diagnosis(**values)
 
 
 def improved(twin: Twin, added: Sequence[AppliedEffect]) -> Twin:

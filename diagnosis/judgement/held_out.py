@@ -79,13 +79,8 @@ def _balanced(problem: Problem) -> list[int]:
     for view in problem.views:
         beam = _beam(view)
         alike = [(*beam, "exposure", view.session.series.exposure_ms), (*beam, "calibrates", view.session.calibrates)]
-
-        def crowded(
-            fold: int, beam: tuple[Any, ...] = beam, alike: list[tuple[Any, ...]] = alike
-        ) -> tuple[int, int, int]:
-            return counts[fold, *beam], sum(counts[fold, *key] for key in alike), fold
-
-        fold = min((0, 1), key=crowded)
+        crowded = [(counts[fold, *beam], sum(counts[fold, *key] for key in alike), fold) for fold in (0, 1)]
+        *_, fold = min(crowded)
         counts.update((fold, *key) for key in (beam, *alike))
         folds.append(fold)
     return folds
@@ -184,8 +179,7 @@ def _power(problem: Problem, leading: Hypothesis) -> NDArray[np.float64]:
     nuisances = LocalNuisances(problem.factors, problem.blocks)
     for point in leading.points():
         total += nuisances.given_others(point.curve.response(point.strength)) ** 2
-        if point.curve.spread is not None:
-            total += point.strength**2 * np.sum(point.curve.spread**2, axis=1)
+        total += point.strength**2 * np.sum(point.curve.chance**2, axis=1)
     return total
 
 

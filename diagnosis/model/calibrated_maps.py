@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.twin import LEAST_PIXELS, Twin
 from ..probes.fixed_pattern import smooth_part
 from ..session.even_maps import full_size, mean_over
 from ..session.session import SessionSeries
-from ..session.summaries import FirstLook
+from ..session.usable import SeenSeries
 
 LEAST_GAIN = 0.05  # of a pixel in use
 
@@ -23,7 +22,7 @@ class CalibratedDarks:
 
     Fields: twin; weights: of each calibrating dark in the dark of an exposure (ms), by name; means_DN (row, column) and
     white_DN2 (row, column or 1, 1; of one frame) of the calibrating darks, by name; frames of the calibrating series, copies left
-    out, by name.
+    out, which say nothing more, by name.
     """
 
     twin: Twin
@@ -110,55 +109,44 @@ def exposure_of(item: SessionSeries) -> float:
     return item.series.exposure_ms or 0.0
 
 
-def calibrated_maps(
-    kept: Sequence[SessionSeries],
-    expected: Mapping[str, ExpectedSeries],
-    looks: Mapping[str, FirstLook],
-    *,
-    twin: Twin,
-    good: NDArray[np.bool_],
-) -> CalibratedMaps:
-    """Dark and gain map from the calibrating series among those kept.
+def calibrated_maps(seen: Sequence[SeenSeries], *, twin: Twin, good: NDArray[np.bool_]) -> CalibratedMaps:
+    """Dark and gain map from the calibrating series among those that can be compared.
 
     Args:
-        kept: series that can be compared.
-        expected: by the twin with all pixels alike, by name.
-        looks: mean frames and numbers of frames, by name.
+        seen: series that can be compared.
         twin: calibrated; its own maps stand in where no series calibrates.
         good: pixels that are not known to be bad (row, column).
 
     Raises:
         InputError: next to no pixel sees light.
     """
-    darks = [item for item in kept if item.calibrates and item.series.kind == "dark"]
-    flats = [item for item in kept if item.calibrates and item.series.kind == "flat"]
-    # copies of a frame say nothing more
-    frames = {item.name: looks[item.name].frames for item in (*darks, *flats)}
+    darks, flats = (
+        [one for one in seen if one.session.calibrates and one.session.series.kind == kind] for kind in ("dark", "flat")
+    )
+    kept = [one.session for one in seen]
     under = CalibratedDarks(
         twin=twin,
-        weights={
-            exposure: _dark_weights(darks, frames, exposure) for exposure in dict.fromkeys(map(exposure_of, kept))
-        },
-        means_DN={item.name: looks[item.name].mean_DN for item in darks},
-        white_DN2={item.name: expected[item.name].white_variance_DN2 for item in darks},
-        frames=frames,
+        weights={exposure: _dark_weights(darks, exposure) for exposure in dict.fromkeys(map(exposure_of, kept))},
+        means_DN={one.name: one.look.mean_DN for one in darks},
+        white_DN2={one.name: one.expected.white_variance_DN2 for one in darks},
+        frames={one.name: one.look.frames for one in (*darks, *flats)},
     )
-    shares = _flat_shares(flats, expected, frames, good)
+    shares = _flat_shares(flats, good)
     gain = np.zeros(good.shape) if flats else _gain_of_twin(twin)
     quantum = white = 0.0
     if not flats:
         quantum, white = _gain_noise_of_twin(twin)
     gain_darks = dict.fromkeys(under.white_DN2, 0.0)
-    for item in flats:
-        model = expected[item.name]
-        share = shares[item.name] / mean_over(model.signal_DN, good)
-        weight = share**2 / frames[item.name]
+    for one in flats:
+        model = one.expected
+        share = shares[one.name] / mean_over(model.signal_DN, good)
+        weight = share**2 / one.look.frames
         quantum += weight * mean_over(model.quantum_variance_DN2, good)
         white += weight * mean_over(model.white_variance_DN2, good)
-        for name, part in under.weights_under(item).items():
+        for name, part in under.weights_under(one.session).items():
             gain_darks[name] -= share * part
         signal = np.maximum(full_size(model.signal_DN, good.shape), 1e-9)
-        gain += shares[item.name] * (looks[item.name].mean_DN - under.under(item)) / signal
+        gain += shares[one.name] * (one.look.mean_DN - under.under(one.session)) / signal
     lit = good & (gain > LEAST_GAIN)
     if np.count_nonzero(lit) < LEAST_PIXELS:
         raise InputError(
@@ -178,37 +166,32 @@ def calibrated_maps(
     )
 
 
-def _flat_shares(
-    flats: Sequence[SessionSeries],
-    expected: Mapping[str, ExpectedSeries],
-    frames: Mapping[str, int],
-    good: NDArray[np.bool_],
-) -> dict[str, float]:
+def _flat_shares(flats: Sequence[SeenSeries], good: NDArray[np.bool_]) -> dict[str, float]:
     """Share of each calibrating flat in the gain map: as its signal-to-noise ratio squared."""
     weights = {}
-    for item in flats:
-        model = expected[item.name]
-        variance = mean_over(model.quantum_variance_DN2 + model.white_variance_DN2, good)
-        weights[item.name] = mean_over(model.signal_DN, good) ** 2 / max(variance, 1e-12) * frames[item.name]
+    for one in flats:
+        variance = mean_over(one.expected.quantum_variance_DN2 + one.expected.white_variance_DN2, good)
+        weights[one.name] = mean_over(one.expected.signal_DN, good) ** 2 / max(variance, 1e-12) * one.look.frames
     total = sum(weights.values())
     return {name: value / total for name, value in weights.items()}
 
 
-def _dark_weights(darks: Sequence[SessionSeries], frames: Mapping[str, int], exposure_ms: float) -> dict[str, float]:
+def _dark_weights(darks: Sequence[SeenSeries], exposure_ms: float) -> dict[str, float]:
     """Weights with which calibrating darks add up to the dark of an exposure; empty without darks."""
     if not darks:
         return {}
-    same = [item for item in darks if abs(exposure_of(item) - exposure_ms) <= 1e-6 * max(exposure_ms, 1)]
+    same = [one for one in darks if abs(exposure_of(one.session) - exposure_ms) <= 1e-6 * max(exposure_ms, 1)]
     used = same or darks
-    x = np.array([exposure_of(item) for item in used])
-    n = np.array([frames[item.name] for item in used], dtype=float)
+    names = [one.name for one in used]
+    x = np.array([exposure_of(one.session) for one in used])
+    n = np.array([one.look.frames for one in used], dtype=float)
     if same or np.ptp(x) <= 0:
-        return dict(zip((item.name for item in used), (n / n.sum()).tolist(), strict=True))
+        return dict(zip(names, (n / n.sum()).tolist(), strict=True))
     # a straight line through the darks, evaluated at the exposure: linear in the darks
     design = np.stack([np.ones_like(x), x], axis=1)
     solved = np.linalg.solve(design.T @ (n[:, None] * design), design.T * n)
     weights = np.array([1.0, exposure_ms]) @ solved
-    return dict(zip((item.name for item in used), weights.tolist(), strict=True))
+    return dict(zip(names, weights.tolist(), strict=True))
 
 
 def _gain_of_twin(twin: Twin) -> NDArray[np.float64]:

@@ -59,6 +59,11 @@ class Curve:
         return np.unique(np.concatenate([np.geomspace(*self.reach, STRENGTH_NODES), ends]))
 
     @property
+    def chance(self) -> NDArray[np.float64]:
+        """What the effect does by chance (probe, factor), a unit of strength: its spread, of no factor where it has none."""
+        return np.zeros((self.responses.shape[1], 0)) if self.spread is None else self.spread
+
+    @property
     def by_chance_alone(self) -> bool:
         """Whether the effect moves no probe by a known amount, but some by chance."""
         return self.spread is not None and not bool(np.any(np.abs(self.responses) > LEAST_RESPONSE))

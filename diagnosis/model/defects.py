@@ -1,19 +1,19 @@
 """Pixels that stand out of the panel and are not known to be bad: they count as outliers and are left out of all else."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.frames.line_model import ExpectedSeries
 from ..probes.fixed_pattern import smooth_part
 from ..probes.lasting import OUTLYING, lasting_pixels
 from ..session.even_maps import NEIGHBOURS_PX, near_steps, signal_map
 from ..session.session import SessionSeries
 from ..session.summaries import BLOCK_PX, LEAST_NOISE_DN2, FirstLook
+from ..session.usable import SeenSeries
 from .calibrated_maps import CalibratedMaps
 from .changes import DUST_LIMIT
 
@@ -32,45 +32,38 @@ class StandingOut:
     any: NDArray[np.bool_]
 
 
-def new_outliers(
-    kept: Sequence[SessionSeries],
-    expected: Mapping[str, ExpectedSeries],
-    looks: Mapping[str, FirstLook],
-    maps: CalibratedMaps,
-) -> StandingOut:
+def new_outliers(seen: Sequence[SeenSeries], maps: CalibratedMaps) -> StandingOut:
     """Pixels in use that stand out in any dark or flat, or in all objects from some time on.
 
     Args:
-        kept: series that can be compared.
-        expected: by the twin with all pixels alike, by name.
-        looks: mean frames and variances, by name.
+        seen: series that can be compared.
         maps: dark and gain map of the calibrating series.
     """
     good, shape = maps.good, maps.good.shape
     outlying, dusty = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
-    for item in kept:
-        if item.series.kind not in ("dark", "flat"):
+    for one in seen:
+        kind, look = one.session.series.kind, one.look
+        if kind not in ("dark", "flat"):
             continue
-        look = looks[item.name]
-        residual = maps.corrected(item, look.mean_DN)
-        if item.series.kind == "flat":
-            signal = signal_map(expected[item.name], shape)
+        residual = maps.corrected(one.session, look.mean_DN)
+        if kind == "flat":
+            signal = signal_map(one.expected, shape)
             residual = residual - signal * float(np.median((residual / np.maximum(signal, 1e-9))[good]))
         residual = residual - smooth_part(residual, good)
         centre = float(np.median(residual[good]))
         spread = 1.4826 * float(np.median(np.abs(residual[good] - centre)))
         departs = np.abs(residual - centre)
         out = departs > OUTLYING * max(spread, math.sqrt(LEAST_NOISE_DN2 / look.frames))
-        if item.series.kind == "flat":
+        if kind == "flat":
             dusty |= out
-            out &= departs > DUST_LIMIT * signal_map(expected[item.name], shape)
+            out &= departs > DUST_LIMIT * signal
         outlying |= out
         if look.frames > 9:
             ratio = look.pair_variance_DN2 / max(float(np.median(look.pair_variance_DN2[good])), LEAST_NOISE_DN2)
             limit = max(_largest_ratio(look.frames), 2.5)
             if bool(np.any(ratio[good] > limit)):
                 outlying |= (ratio > limit * np.maximum(1.0, _of_lines(ratio, good))) & good
-    outlying |= _out_in_every_object(kept, expected, looks, maps)
+    outlying |= _out_in_every_object(seen, maps)
     # a detector full of outliers is a pattern, not a set of defects
     bad, all_of_them = (
         found if found.sum() < _MOST_OUTLYING * good.sum() else np.zeros(shape, dtype=bool)
@@ -87,12 +80,7 @@ def _without_areas(outlying: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(outlying & ~maximum_filter(whole, BLOCK_PX), dtype=bool)
 
 
-def _out_in_every_object(
-    kept: Sequence[SessionSeries],
-    expected: Mapping[str, ExpectedSeries],
-    looks: Mapping[str, FirstLook],
-    maps: CalibratedMaps,
-) -> NDArray[np.bool_]:
+def _out_in_every_object(seen: Sequence[SeenSeries], maps: CalibratedMaps) -> NDArray[np.bool_]:
     """Pixels that stand out of their neighbours whatever lies before them, from some time on: no dark or flat need follow.
 
     A view in which a step of the object passes by a pixel tells nothing of it.
@@ -101,24 +89,26 @@ def _out_in_every_object(
 
     good = maps.good
     # a hot one stands out of the longer exposures alone
-    alike: dict[tuple[float | None, float | None], list[SessionSeries]] = {}
-    for item in kept:
-        if item.series.kind == "object" and not item.calibrates:
-            alike.setdefault((item.series.kV, item.series.exposure_ms), []).append(item)
+    alike: dict[tuple[float | None, float | None], list[SeenSeries]] = {}
+    for one in seen:
+        series = one.session.series
+        if series.kind == "object" and not one.session.calibrates:
+            alike.setdefault((series.kV, series.exposure_ms), []).append(one)
     found = np.zeros(good.shape, dtype=bool)
     for members in alike.values():
         times, views = np.zeros(good.shape), np.zeros(good.shape)
         seen_in: dict[str, NDArray[np.bool_]] = {}
-        for item in reversed(members):
-            measured = maps.corrected(item, looks[item.name].mean_DN)
-            signal = signal_map(expected[item.name], good.shape)
+        for one in reversed(members):
+            measured = maps.corrected(one.session, one.look.mean_DN)
+            signal = signal_map(one.expected, good.shape)
             residual = measured - signal
             residual = residual - median_filter(residual, size=NEIGHBOURS_PX, mode="nearest")
             even = ~near_steps(signal)
             views += even
             spread = max(1.4826 * float(np.median(np.abs(residual[good]))), 1e-9)
             times += even & (np.abs(residual) > OUTLYING * spread)
-            seen_in[item.series.scene] = even | seen_in.get(item.series.scene, np.zeros_like(even))
+            scene = one.session.series.scene
+            seen_in[scene] = even | seen_in.get(scene, np.zeros_like(even))
             scenes = np.sum(list(seen_in.values()), axis=0)
             found |= (scenes >= _LEAST_SCENES) & (times >= _NEARLY_ALWAYS * views)
     return found
@@ -141,14 +131,12 @@ def _largest_ratio(frames: int) -> float:
     return float(2.0 * gammainccinv(0.5 * freedom, 1e-7) / freedom)
 
 
-def lasting_anywhere(
-    kept: Sequence[SessionSeries], looks: Mapping[str, FirstLook], good: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def lasting_anywhere(seen: Sequence[SeenSeries], good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Good pixels (row, column) whose level lasts for some frames in any later dark."""
     found = np.zeros(good.shape, dtype=bool)
-    for item in kept:
-        if item.series.kind == "dark" and not item.calibrates:
-            look = looks[item.name]
+    for one in seen:
+        if one.session.series.kind == "dark" and not one.session.calibrates:
+            look = one.look
             found |= lasting_pixels(
                 look.stack_variance_DN2, look.pair_variance_DN2, look.frames, good, least_DN2=LEAST_NOISE_DN2
             )

@@ -23,6 +23,7 @@ from ..probes.registration import (
 from ..probes.straight_edge import covered_scene
 from ..session.even_maps import full_size, signal_map
 from ..session.session import SessionSeries
+from ..session.usable import SeenSeries
 from . import changes as scales
 
 SHARP_SCENES = ("edge", "disc")  # drawn true to their outline; steps of wedges and products only to their maps' pixels
@@ -40,12 +41,11 @@ _SMEARED, _SMEARED_SIZES = 0.7, 3  # share of what is left that one of so many b
 class PlacedSeries:
     """Series with their scenes drawn where they were found.
 
-    Fields: kept, in order of time, requests displaced; expected: of these, by name; placements: of series whose scene was
-    found, by name; telling: of each of these, the one of its place that tells the displacement.
+    Fields: seen, in order of time, requests displaced; placements: of series whose scene was found, by name; telling: of each of
+    these, the one of its place that tells the displacement.
     """
 
-    kept: tuple[SessionSeries, ...]
-    expected: Mapping[str, ExpectedSeries]
+    seen: tuple[SeenSeries, ...]
     placements: Mapping[str, Placement]
     telling: Mapping[str, SeriesRequest]
 
@@ -63,103 +63,95 @@ class MeasuredScenes:
     sharp: bool
     expect: Callable[[SeriesRequest], ExpectedSeries]
 
-    def of(self, members: Sequence[SessionSeries]) -> list[NDArray[np.float64]]:
+    def of(self, members: Sequence[SeenSeries]) -> list[NDArray[np.float64]]:
         """Measured pictures of some series."""
-        return [self.pictures[item.name] for item in members]
+        return [self.pictures[one.name] for one in members]
 
-    def drawn(self, members: Sequence[SessionSeries], at: tuple[float, float]) -> list[NDArray[np.float64]]:
+    def drawn(self, members: Sequence[SeenSeries], at: tuple[float, float]) -> list[NDArray[np.float64]]:
         """Their pictures by the base twin with the scene displaced along rows and columns, px."""
-        asked = [replace(item.request, displacement_px=at) for item in members]
+        asked = [replace(one.session.request, displacement_px=at) for one in members]
         return [signal_map(self.expect(request), self.clean.shape) for request in asked]
 
 
-def place_scenes(
-    kept: Sequence[SessionSeries],
-    expected: Mapping[str, ExpectedSeries],
-    measured: MeasuredScenes,
-) -> PlacedSeries:
+def place_scenes(seen: Sequence[SeenSeries], measured: MeasuredScenes) -> PlacedSeries:
     """Registers every scene, all series of a place together.
 
     Args:
-        kept: series that can be compared.
-        expected: by the base twin, scenes where their maps have them, by name.
+        seen: series that can be compared, scenes where their maps have them.
         measured: what they are placed by.
     """
-    requests: dict[str, SeriesRequest] = {}
-    drawn = dict(expected)
+    placed = {one.name: one for one in seen}
     placements: dict[str, Placement] = {}
     telling: dict[str, SeriesRequest] = {}
-    for stated in _places(kept).values():
-        members, placement = _as_drawn(stated, expected, measured)
+    for stated in _places(seen).values():
+        members, placement = _as_drawn(stated, measured)
         if placement is None:
             continue
-        for item in members:
-            placements[item.name] = placement
-            requests[item.name] = replace(item.request, displacement_px=(placement.row_px, placement.column_px))
-            drawn[item.name] = measured.expect(requests[item.name])
+        lies_px = placement.row_px, placement.column_px
+        for one in members:
+            placements[one.name] = placement
+            request = replace(one.session.request, displacement_px=lies_px)
+            placed[one.name] = replace(_asking(one, request), expected=measured.expect(request))
         # the series with the most light says most of where the scene lies
-        tells = max(members, key=lambda item: _light_DN(item, expected[item.name]))
-        telling |= {item.name: requests[tells.name] for item in members}
-    return PlacedSeries(
-        kept=tuple(replace(item, request=requests.get(item.name, item.request)) for item in kept),
-        expected=drawn,
-        placements=placements,
-        telling=telling,
-    )
+        tells = max(stated, key=_light_DN)
+        telling |= {one.name: placed[tells.name].session.request for one in members}
+    return PlacedSeries(seen=tuple(placed.values()), placements=placements, telling=telling)
 
 
-def _light_DN(item: SessionSeries, expected: ExpectedSeries) -> float:
+def _asking(one: SeenSeries, request: SeriesRequest) -> SeenSeries:
+    """A series with another request to the forward model."""
+    return replace(one, session=replace(one.session, request=request))
+
+
+def _light_DN(one: SeenSeries) -> float:
     """Light of all exposures of a series, mean over the pixels."""
-    return item.series.n_frames * item.request.exposures_per_frame * float(np.mean(expected.signal_DN))
+    exposures = one.session.series.n_frames * one.session.request.exposures_per_frame
+    return exposures * float(np.mean(one.expected.signal_DN))
 
 
-def _places(kept: Sequence[SessionSeries]) -> dict[tuple[str, float], list[SessionSeries]]:
+def _places(seen: Sequence[SeenSeries]) -> dict[tuple[str, float], list[SeenSeries]]:
     """Object series by where their scene stood."""
-    places: dict[tuple[str, float], list[SessionSeries]] = {}
-    for item in kept:
-        if item.series.kind == "object":
-            places.setdefault(item.place, []).append(item)
+    places: dict[tuple[str, float], list[SeenSeries]] = {}
+    for one in seen:
+        if one.session.series.kind == "object":
+            places.setdefault(one.session.place, []).append(one)
     return places
 
 
-def _as_drawn(
-    members: Sequence[SessionSeries], expected: Mapping[str, ExpectedSeries], measured: MeasuredScenes
-) -> tuple[Sequence[SessionSeries], Placement | None]:
+def _as_drawn(members: Sequence[SeenSeries], measured: MeasuredScenes) -> tuple[Sequence[SeenSeries], Placement | None]:
     """Series of one place with the maps that show their scene more truly, and where it lies.
 
     A straight or round border is drawn as its map has it or as it runs: a map of few points a pixel has stairs, which real pixels,
     that see their whole square, have not; most simulations see the middle of it.
     """
-    placement = _placement(members, expected, measured)
-    asked = members[0].request
+    placement = _placement(members, measured)
+    asked = members[0].session.request
     covered = covered_scene(asked.scene_kind, asked.thickness_mm or {})
     if placement is None or covered is None:
         return members, placement
-    others = [replace(item, request=replace(item.request, thickness_mm=covered)) for item in members]
+    others = [_asking(one, replace(one.session.request, thickness_mm=covered)) for one in members]
 
-    def left(drawn: Sequence[SessionSeries]) -> float:
+    def left(drawn: Sequence[SeenSeries]) -> float:
         at = (placement.row_px, placement.column_px)
         here = replace(placement, row_px=0.0, column_px=0.0)
         return left_over(measured.of(drawn), measured.drawn(drawn, at), measured.clean, here)
 
     if left(others) >= left(members):
         return members, placement
-    redrawn = {item.name: measured.expect(item.request) for item in others}
-    return others, _placement(others, redrawn, measured)
+    others = [replace(one, expected=measured.expect(one.session.request)) for one in others]
+    return others, _placement(others, measured)
 
 
-def _placement(
-    members: Sequence[SessionSeries], expected: Mapping[str, ExpectedSeries], measured: MeasuredScenes
-) -> Placement | None:
+def _placement(members: Sequence[SeenSeries], measured: MeasuredScenes) -> Placement | None:
     """Where the scene of series of one place lies; None: nothing shows it, or it is nowhere near its maps."""
     clean, sharp = measured.clean, measured.sharp
     shape, seen = clean.shape, measured.of(members)
     noises = [
-        full_size(expected[item.name].quantum_variance_DN2 + expected[item.name].white_variance_DN2, shape)
-        / item.series.n_frames
-        for item in members
+        full_size(one.expected.quantum_variance_DN2 + one.expected.white_variance_DN2, shape)
+        / one.session.series.n_frames
+        for one in members
     ]
-    pictured = [signal_map(expected[item.name], shape) for item in members]
+    pictured = [signal_map(one.expected, shape) for one in members]
     found = register(seen, pictured, noises, clean)
     if not found.found:
         return None
@@ -168,11 +160,11 @@ def _placement(
         return measured.drawn(members, at)
 
     # drawn where it lies, an edge shows what is left of its displacement more truly than any resampled picture
-    if sharp or members[0].request.scene_kind in SHARP_SCENES:
+    if sharp or members[0].session.request.scene_kind in SHARP_SCENES:
         found = register_drawn(seen, drawn, noises, clean, found, whole_cells=sharp)
     else:
         # steps of many heights: their places are told by slopes, not by what is left, which other things make as well
-        found, blur = _smeared(members, seen, pictured, noises, clean, found)
+        found, blur = _smeared([one.session for one in members], seen, pictured, noises, clean, found)
         for _ in range(_PLACEMENTS):
             rest = register(seen, blur(drawn((found.row_px, found.column_px))), noises, clean)
             if math.hypot(rest.row_px, rest.column_px) > _CLOSER * math.hypot(found.row_px, found.column_px):

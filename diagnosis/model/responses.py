@@ -279,7 +279,6 @@ def session_model(
     model: ForwardModel,
     maps: CalibratedMaps,
     placed: PlacedSeries,
-    seen: SeenSeries,
     summaries: Mapping[str, SeriesSummary],
     clean: NDArray[np.bool_],
     *,
@@ -291,25 +290,23 @@ def session_model(
         model: the base twin.
         maps: dark and gain map of the calibrating series.
         placed: series with their scenes drawn where they lie.
-        seen: noise labels.
         summaries: what the frames' noise says, by name of series.
         clean: pixels in use that do not stand out (row, column).
         lines_DN2: variance of rows and columns from exposure to exposure that the panel has all the time, DN^2.
     """
-    signals_DN = {item.name: mean_over(placed.expected[item.name].signal_DN, clean) for item in placed.kept}
+    seen = placed.seen
+    signals_DN = {one.name: mean_over(one.expected.signal_DN, clean) for one in seen}
     session = SessionModel(model=model, maps=maps, series=(), signals_DN=signals_DN, lines_DN2=lines_DN2)
-    lines = {item.name: _lines_of_noise(placed.expected[item.name]) for item in placed.kept if item.calibrates}
-    counting, copies = counting_series(placed.kept), counted_copies(placed.kept, seen.looks)
-    darks = [item for item in placed.kept if item.series.kind == "dark" and not item.calibrates]
+    lines = {one.name: _lines_of_noise(one.expected) for one in seen if one.session.calibrates}
+    counting, copies = counting_series([one.session for one in seen]), counted_copies(seen)
+    darks = [one.session for one in seen if one.session.series.kind == "dark" and not one.session.calibrates]
     series = []
     before: float | None = None
-    for item in placed.kept:
-        expected = placed.expected[item.name]
+    for shown in seen:
+        item, expected = shown.session, shown.expected
         context = _context(
-            item,
-            expected,
+            shown,
             maps,
-            seen,
             clean,
             signal_DN=signals_DN[item.name],
             previous_DN=before,
@@ -341,10 +338,8 @@ def session_model(
 
 
 def _context(
-    item: SessionSeries,
-    expected: ExpectedSeries,
+    shown: SeenSeries,
     maps: CalibratedMaps,
-    seen: SeenSeries,
     clean: NDArray[np.bool_],
     *,
     signal_DN: float,
@@ -355,13 +350,14 @@ def _context(
     later_darks: tuple[tuple[int, int], ...],
 ) -> ScalarContext:
     """What a series' scalar probes refer to; previous_DN: signal of the last lit series before it; others as its fields."""
-    in_use, clean = int(clean.sum()), clean & seen.readable[item.name]
+    item, expected = shown.session, shown.expected
+    in_use, clean = int(clean.sum()), clean & shown.readable
     kind, frames, lit = item.series.kind, item.series.n_frames, item.request.beam_on
     lit_DN = np.asarray(signal_DN if lit else 0.0)
     squared = float(lit_DN) ** 2
     noise_of_maps = maps.gain_quantum * squared, maps.gain_white * squared + float(maps.dark_noise(item, lit_DN))
     noise = pattern_noise(
-        expected, clean, seen.looks[item.name].frames, *noise_of_maps, lines=kind == "flat" and bool(maps.shares)
+        expected, clean, shown.look.frames, *noise_of_maps, lines=kind == "flat" and bool(maps.shares)
     )
     read_DN2 = mean_over(expected.white_variance_DN2, clean) if maps.read_DN2 is None else maps.read_DN2
     stands_out_DN = max(OUTLIER_SD * math.sqrt(noise[0]), DUST_LIMIT * max(signal_DN, 0.0))
@@ -369,8 +365,8 @@ def _context(
         kind=kind,
         frames=frames,
         good=clean,
-        labels=np.where(clean, seen.labels[item.name], -1),
-        label_names=seen.label_names[item.name],
+        labels=np.where(clean, shown.labels, -1),
+        label_names=shown.label_names,
         reference_signal_DN=max(signal_DN, 1e-9) if lit else 1.0,
         previous_signal_DN=previous_DN,
         calibrates=item.calibrates,

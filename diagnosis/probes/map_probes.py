@@ -66,8 +66,8 @@ class MapProjection:
                 chosen.append(number)
                 columns.append(left[number] / math.sqrt(rest))
                 left -= np.outer(columns[-1], columns[-1])
-        # the images are not kept: fifty a series would be most of the memory
-        self._names = tuple(
+        # one a probe; the images are not kept: fifty a series would be most of the memory
+        self.names = tuple(
             ProbeName(axis=item.axis, statistic="mean frame", location=item.name, unit=item.unit)
             for item in (used[number] for number in chosen)
         )
@@ -83,7 +83,7 @@ class MapProjection:
         self.of_level = self._rows.sum(axis=1, dtype=np.float64)  # (probe,) of 1 DN in every pixel
 
     def __len__(self) -> int:
-        return len(self._names)
+        return len(self.names)
 
     def apply(self, images: NDArray[np.floating]) -> NDArray[np.float64]:
         """Standardised projections (..., probe) of maps (..., row, column), DN."""
@@ -131,10 +131,6 @@ class MapProjection:
         """Variance (2, probe) that noise of 1 DN, common to each row and then common to each column, gives the projections."""
         pixels = self._rows.reshape(len(self), *self._shape)
         return np.stack([np.sum(pixels.sum(axis=axis, dtype=np.float64) ** 2, axis=1) for axis in (2, 1)])
-
-    def names(self) -> list[ProbeName]:
-        """One name a probe."""
-        return list(self._names)
 
 
 def _separated(table: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -211,35 +211,32 @@ def _measured(
         InputError: no series that can be compared.
     """
     known_good = twin.maps.bad_pixels == 0
-    seen = _seen_series(session, acquisition, model, good=known_good, side=side, tell=tell)
-    maps = calibrated_maps(seen.kept, seen.expected, seen.looks, twin=twin, good=known_good)
-    standing_out = new_outliers(seen.kept, seen.expected, seen.looks, maps)
-    lasting = lasting_anywhere(seen.kept, seen.looks, maps.good)
+    seen, skipped = _seen_series(session, acquisition, model, good=known_good, side=side, tell=tell)
+    maps = calibrated_maps(seen, twin=twin, good=known_good)
+    standing_out = new_outliers(seen, maps)
+    lasting = lasting_anywhere(seen, maps.good)
     outlying = standing_out.bad & ~lasting
     clean = maps.good & ~standing_out.any & ~lasting
     # they count as outliers; what else is said of noise is said without them
     summaries = summarise_all(seen, clean, tell=tell)
-    lines_DN2 = usual_line_noise(seen.kept, seen.expected, summaries, clean)
-    summaries = {
-        item.name: summaries[item.name].without_lines(*(one / item.request.exposures_per_frame for one in lines_DN2))
-        for item in seen.kept
-    }
+    lines_DN2 = usual_line_noise(seen, summaries, clean)
+    for one in seen:
+        exposures = one.session.request.exposures_per_frame
+        summaries[one.name] = summaries[one.name].without_lines(*(each / exposures for each in lines_DN2))
     tell("registration")
-    pictures = {item.name: maps.corrected(item, seen.looks[item.name].mean_DN) for item in seen.kept}
+    pictures = {one.name: maps.corrected(one.session, one.look.mean_DN) for one in seen}
     scenes = MeasuredScenes(pictures=pictures, clean=clean, sharp=model.sharp, expect=model.expect)
-    placed = place_scenes(seen.kept, seen.expected, scenes)
+    placed = place_scenes(seen, scenes)
     return _Measured(
-        expected=session_model(model, maps, placed, seen, summaries, clean, lines_DN2=lines_DN2),
+        expected=session_model(model, maps, placed, summaries, clean, lines_DN2=lines_DN2),
         pictures=pictures,
         summaries=summaries,
-        memory={
-            item.name: memory_of(seen.looks[item.name], outlying) for item in seen.kept if item.series.kind == "dark"
-        },
-        copies={name: count for name, (count, _) in counted_copies(placed.kept, seen.looks).items()},
+        memory={one.name: memory_of(one.look, outlying) for one in seen if one.session.series.kind == "dark"},
+        copies={name: count for name, (count, _) in counted_copies(seen).items()},
         clean=clean,
         lasting=lasting,
         outliers=int(np.count_nonzero(outlying)),
-        skipped=seen.skipped,
+        skipped=tuple(skipped),
     )
 
 
@@ -251,8 +248,8 @@ def _seen_series(
     good: NDArray[np.bool_],
     side: int,
     tell: Callable[[str], None],
-) -> SeenSeries:
-    """Series that the base twin can be compared with, and a first look at their frames.
+) -> tuple[list[SeenSeries], list[str]]:
+    """Series that the base twin can be compared with and a first look at their frames, and why others cannot be.
 
     Raises:
         InputError: there are none.
@@ -268,16 +265,16 @@ def _seen_series(
             expected="darks and flats whose kV, exposure and tube load are stated",
         )
     tell("frames")
-    return look_at_all(
+    seen, left_out = look_at_all(
         [_as_light(item, model) for item in stated if item.name in expected],
         expected,
         good=good,
         bits=acquisition.instrument.bits,
         dark_at=model.base.maps.dark_at,
         side=side,
-        skipped=skipped,
         tell=tell,
     )
+    return seen, [*skipped, *left_out]
 
 
 def _as_light(item: SessionSeries, model: ForwardModel) -> SessionSeries:

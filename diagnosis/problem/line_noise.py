@@ -5,17 +5,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.frames.line_model import ExpectedSeries
 from ..model.changes import LINE_NOISE_LIMIT
-from ..session.session import SessionSeries
 from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
+from ..session.usable import SeenSeries
 
 
 def usual_line_noise(
-    kept: Sequence[SessionSeries],
-    expected: Mapping[str, ExpectedSeries],
-    summaries: Mapping[str, SeriesSummary],
-    clean: NDArray[np.bool_],
+    seen: Sequence[SeenSeries], summaries: Mapping[str, SeriesSummary], clean: NDArray[np.bool_]
 ) -> tuple[float, float]:
     """Variance (DN^2) of the rows' and of the columns' offsets in one exposure, from darks, at most what no effect is.
 
@@ -23,26 +19,25 @@ def usual_line_noise(
     of it already is not counted again.
 
     Args:
-        kept: series that can be compared; the darks that calibrate tell, all darks where none does.
-        expected: by the twin, by name.
+        seen: series that can be compared; the darks that calibrate tell, all darks where none does.
         summaries: what the frames' noise says, by name.
         clean: pixels in use that do not stand out (row, column).
     """
-    darks = [item for item in kept if item.series.kind == "dark" and summaries[item.name].frames > 2]
-    darks = [item for item in darks if item.calibrates] or darks
+    darks = [one for one in seen if one.session.series.kind == "dark" and summaries[one.name].frames > 2]
+    darks = [one for one in darks if one.session.calibrates] or darks
     total = np.zeros(2)
     steps = 0
     # in a row, and in a column
     pixels = np.array(clean.shape[::-1], dtype=np.float64)
-    for item in darks:
-        found, model = summaries[item.name], expected[item.name]
+    for one in darks:
+        found, model = summaries[one.name], one.expected
         variance = float(np.mean(found.pair_variance_DN2[clean]))
         if not variance > LEAST_NOISE_DN2:
             continue
         of_lines = np.array([found.row_variance_DN2, found.column_variance_DN2])
         own = (of_lines - variance / pixels) / (1.0 - 1.0 / pixels)
         known = np.array([model.row_variance_DN2, model.column_variance_DN2])
-        exposures = item.request.exposures_per_frame
+        exposures = one.session.request.exposures_per_frame
         limit = LINE_NOISE_LIMIT**2 * variance
         weight = found.frames - 1
         total += weight * np.clip(own - known, 0.0, limit) * exposures

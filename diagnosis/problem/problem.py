@@ -114,13 +114,12 @@ class Problem:
 
     def with_chance(self, points: Sequence[Point]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Factors (probe, factor) of nuisances and of what effects do by chance; variance (probe,) of each probe by itself."""
-        factors, variance = [self.factors], np.ones(len(self.residual))
+        factors = np.concatenate([self.factors, *(point.strength * point.curve.chance for point in points)], axis=1)
+        variance = np.ones(len(self.residual))
         for point in points:
-            if point.curve.spread is not None:
-                factors.append(point.strength * point.curve.spread)
             if point.curve.jitter is not None:
                 variance += point.strength**2 * point.curve.jitter
-        return np.concatenate(factors, axis=1), variance
+        return factors, variance
 
     @property
     def places(self) -> NDArray[np.intp]:

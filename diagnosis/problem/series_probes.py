@@ -62,7 +62,8 @@ class SeriesProbes:
     @property
     def names(self) -> list[ProbeName]:
         """One name a probe."""
-        return self.projection.names() + [_named(probe) for probe in self.scalars]
+        scalars = (ProbeName(axis=one.axis, statistic=one.name, location="", unit=one.unit) for one in self.scalars)
+        return [*self.projection.names, *scalars]
 
     @property
     def sd(self) -> NDArray[np.float64]:
@@ -107,10 +108,6 @@ class SeriesProbes:
     def of_scalars(self, change: Callable[[Scalar], float]) -> NDArray[np.float64]:
         """Response (probe,), not shrunk, to changes of the scalars alone, each in its unit."""
         return np.concatenate([np.zeros(len(self.projection)), [change(probe) / probe.sd for probe in self.scalars]])
-
-
-def _named(probe: Scalar) -> ProbeName:
-    return ProbeName(axis=probe.axis, statistic=probe.name, location="", unit=probe.unit)
 
 
 def mean_frame(

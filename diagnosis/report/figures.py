@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...reports import AFTER, BEFORE, Bars, Chart, Line, Picture, Points, Rule
-from ...reports.chart import SERIES_COLOURS, SHAPES, Shape, asinh_ticks, rows_px
+from ...reports.chart import SERIES_COLOURS, SHAPES, asinh_ticks, rows_px
 from ..inference.inference import title_of
 from ..judgement.answer import Diagnosis
 from ..problem.problem import SeriesView
@@ -231,7 +231,7 @@ def places_chart(diagnosis: Diagnosis) -> Chart:
                 names=named,
                 label=axis_text(axis),
                 colour=SERIES_COLOURS[number % len(SERIES_COLOURS)],
-                shape=_shape(number),
+                shape=SHAPES[number % len(SHAPES)],
                 size_px=4.5,
             )
         )
@@ -251,10 +251,6 @@ def places_chart(diagnosis: Diagnosis) -> Chart:
         wide=True,
         height_px=420,
     )
-
-
-def _shape(number: int) -> Shape:
-    return SHAPES[number % len(SHAPES)]
 
 
 def hypotheses_chart(diagnosis: Diagnosis) -> Chart:

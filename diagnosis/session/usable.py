@@ -19,22 +19,26 @@ _MOST_SATURATED = 1e-3  # share of the pixels
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeenSeries:
-    """Series that can be compared, in order of time, and what a first pass over their frames shows, by name.
+    """A series that can be compared, and what a first pass over its frames shows.
 
-    Fields: kept; expected: by the base twin; looks; readable (row, column): pixels whose noise is not cut off at 0; labels (row,
-    column): noise label of each pixel, -1: none; label_names; skipped: what is said of series that are left out.
+    Fields: session; expected: by the base twin; look; readable (row, column): pixels whose noise is not cut off at 0; labels (row,
+    column): noise label of each pixel, -1: none; label_names.
     """
 
-    kept: tuple[SessionSeries, ...]
-    expected: dict[str, ExpectedSeries]
-    looks: dict[str, FirstLook]
-    readable: dict[str, NDArray[np.bool_]]
-    labels: dict[str, NDArray[np.int64]]
-    label_names: dict[str, tuple[str, ...]]
-    skipped: tuple[str, ...]
+    session: SessionSeries
+    expected: ExpectedSeries
+    look: FirstLook
+    readable: NDArray[np.bool_]
+    labels: NDArray[np.int64]
+    label_names: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """The series' name."""
+        return self.session.name
 
 
-def counted_copies(kept: Sequence[SessionSeries], looks: Mapping[str, FirstLook]) -> dict[str, tuple[int, int]]:
+def counted_copies(seen: Sequence[SeenSeries]) -> dict[str, tuple[int, int]]:
     """Frames that are copies of earlier ones of their series, and those that may be: of all series that calibrate, and of all others.
 
     Each pair by the name of the last of these series, which counts them. Series without any noise are left out.
@@ -42,11 +46,11 @@ def counted_copies(kept: Sequence[SessionSeries], looks: Mapping[str, FirstLook]
     found: dict[str, tuple[int, int]] = {}
     for calibrates in (True, False):
         members = [
-            item for item in kept if item.calibrates == calibrates and np.any(looks[item.name].stack_variance_DN2 > 0)
+            one for one in seen if one.session.calibrates == calibrates and np.any(one.look.stack_variance_DN2 > 0)
         ]
         if members:
-            copies = sum(looks[item.name].copies for item in members)
-            found[members[-1].name] = copies, sum(item.series.n_frames - 1 for item in members)
+            copies = sum(one.look.copies for one in members)
+            found[members[-1].name] = copies, sum(one.session.series.n_frames - 1 for one in members)
     return found
 
 
@@ -83,16 +87,15 @@ def _why_not(item: SessionSeries, acquisition: AcquisitionFile) -> str:
 
 def look_at_all(
     items: Sequence[SessionSeries],
-    expected: dict[str, ExpectedSeries],
+    expected: Mapping[str, ExpectedSeries],
     *,
     good: NDArray[np.bool_],
     bits: int | None,
     dark_at: Callable[[float | None], NDArray[np.floating]],
     side: int,
-    skipped: Sequence[str],
     tell: Callable[[str], None],
-) -> SeenSeries:
-    """First pass over the frames; series that are saturated, or nearly all cut off at 0, are left out.
+) -> tuple[list[SeenSeries], list[str]]:
+    """First pass over the frames; and why series are left out: saturated ones, and those that are nearly all cut off at 0.
 
     Args:
         items: series to look at.
@@ -101,61 +104,52 @@ def look_at_all(
         bits: of the ADC; None: unknown.
         dark_at: dark (row, column) of an exposure time, ms.
         side: of the squares of the panel's pixels that stand for pixels.
-        skipped: what is said of series that were left out before.
         tell: called with the name of each stage.
     """
     saturation_DN = None if bits is None else 2.0**bits - 1
-    looks: dict[str, FirstLook] = {}
-    labels: dict[str, NDArray[np.int64]] = {}
-    label_names: dict[str, tuple[str, ...]] = {}
-    readable: dict[str, NDArray[np.bool_]] = {}
-    left_out: dict[str, str] = {}
+    seen: list[SeenSeries] = []
+    left_out: list[str] = []
     for item in items:
         model = expected[item.name]
         signal = signal_map(model, good.shape)
-        readable[item.name] = np.ones(good.shape, dtype=bool)
+        readable = np.ones(good.shape, dtype=bool)
         if item.ends_at_zero and item.request.beam_on:
-            readable[item.name] = _above_noise(item, model, signal, dark_at=dark_at, side=side)
-            if (readable[item.name] & good).sum() < min(_LABEL_PIXELS, good.sum() / 2):
-                left_out[item.name] = f"{item.name}: so dark that noise below 0 was cut off in nearly all pixels"
+            readable = _above_noise(item, model, signal, dark_at=dark_at, side=side)
+            if (readable & good).sum() < min(_LABEL_PIXELS, good.sum() / 2):
+                left_out.append(f"{item.name}: so dark that noise below 0 was cut off in nearly all pixels")
                 continue
-        labels[item.name], label_names[item.name] = _labels(signal, item.series.kind, good & readable[item.name])
+        labels, names = _labels(signal, item.series.kind, good & readable)
         tell(f"frames of {item.name}")
-        looks[item.name] = look_at_series(
+        look = look_at_series(
             item.series.iter_frames(),
             good=good,
             pattern=_pattern(item, signal, good),
             name=f"series {item.name}",
             saturation_DN=saturation_DN,
         )
-        full = looks[item.name].saturated_share
-        if full > _MOST_SATURATED and item.series.kind != "dark":
-            left_out[item.name] = f"{item.name}: saturated in {100 * full:.3g} % of the pixels"
-    return SeenSeries(
-        kept=tuple(item for item in items if item.name not in left_out),
-        expected=expected,
-        looks=looks,
-        readable=readable,
-        labels=labels,
-        label_names=label_names,
-        skipped=(*skipped, *left_out.values()),
-    )
+        if look.saturated_share > _MOST_SATURATED and item.series.kind != "dark":
+            left_out.append(f"{item.name}: saturated in {100 * look.saturated_share:.3g} % of the pixels")
+            continue
+        seen.append(
+            SeenSeries(session=item, expected=model, look=look, readable=readable, labels=labels, label_names=names)
+        )
+    return seen, left_out
 
 
 def summarise_all(
-    seen: SeenSeries, clean: NDArray[np.bool_], *, tell: Callable[[str], None]
-) -> Mapping[str, SeriesSummary]:
+    seen: Sequence[SeenSeries], clean: NDArray[np.bool_], *, tell: Callable[[str], None]
+) -> dict[str, SeriesSummary]:
     """What the frames' noise says in pixels that do not stand out (`clean`, (row, column)), by name of series."""
     summaries: dict[str, SeriesSummary] = {}
-    for item in seen.kept:
-        tell(f"frames of {item.name} without outliers")
-        good = clean & seen.readable[item.name]
-        summaries[item.name] = summarise_series(
-            item.series.iter_frames(),
+    for one in seen:
+        tell(f"frames of {one.name} without outliers")
+        good = clean & one.readable
+        summaries[one.name] = summarise_series(
+            one.session.series.iter_frames(),
             good=good,
-            labels=seen.labels[item.name],
-            pattern=_pattern(item, signal_map(seen.expected[item.name], good.shape), good),
-            name=f"series {item.name}",
+            labels=one.labels,
+            pattern=_pattern(one.session, signal_map(one.expected, good.shape), good),
+            name=f"series {one.name}",
         )
     return summaries
 

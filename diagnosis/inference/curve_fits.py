@@ -13,7 +13,9 @@ from .discrepancy import LEAST_MOVED, LEVELS, Levels, only
 from .observed import Observed, Point
 
 _ROUNDS, _SETTLED = 4, 0.05  # in which a level's best strength is found, and change of its logarithm that ends them
-_VARIANTS = 3  # of an effect that are fitted with all levels, at least
+IN_FULL = (
+    3  # variants of an effect, effects, and pairs, the likeliest at first sight, that are weighed in full, at least
+)
 _CLOSE = math.log(100.0)  # of log evidence: what is less likely than that changes a mean by less than one per cent
 _WEAK = 0.3  # of the best strength
 IMPLAUSIBLE = 0.01  # probability that an effect is weaker or stronger than its plausible range
@@ -138,7 +140,7 @@ def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
         ranked.setdefault(curves[number].effect, []).append(number)
     for numbers in ranked.values():
         least = found[numbers[0]].log_evidence - _CLOSE
-        close = max(_VARIANTS, sum(found[number].log_evidence > least for number in numbers))
+        close = max(IN_FULL, sum(found[number].log_evidence > least for number in numbers))
         for number in numbers[:close]:
             found[number] = fit_effect(observed, curves[number])
         for number in numbers[close:]:

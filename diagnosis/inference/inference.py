@@ -21,14 +21,13 @@ import numpy as np
 
 from ...generator.effects import EFFECTS
 from ..model.curves import Curve
-from .curve_fits import CurveFit, interval_of, log_mean_exp
+from .curve_fits import IN_FULL, CurveFit, interval_of, log_mean_exp
 from .discrepancy import LEVELS, at_most_off, log_frequency, log_misfit
 from .observed import Observed, Point
 from .pairs import Single, log_odds_of_leak, log_odds_of_leak_in, log_prior, weigh_pairs
 from .unknown import LOG_DENSITY, ExtraVariance, Families, fit_extra_variance
 
 UNKNOWN = "unknown_effect"
-_WITH_MISFIT = 3  # effects, and pairs, the likeliest, whose misfit is looked at at least
 _NEAR = 10.0  # of log evidence: what lies so near to the likeliest, odds of 22,000, is looked at as that is
 # the likeliest effects that are the first of a pair at least: with six the same are named (notebook, ablation)
 _PAIRS_FROM = 2
@@ -145,7 +144,7 @@ def _weighed(
         single = singles[effect]
         found = _of_fits((effect,), {effect: single.best}, single.log_evidence)
         found = replace(found, strengths={effect: interval_of(single.fits)})
-        if misfits and effect in {*ranked[:_WITH_MISFIT], *near}:
+        if misfits and effect in {*ranked[:IN_FULL], *near}:
             found = left.of_kind(found, [single.best])[0]
             alike.append(left.of_another(single))
         weighed.append((found, of_single))
@@ -159,7 +158,7 @@ def _weighed(
     least = max((pair.log_evidence for pair in pairs), default=0.0) - _NEAR
     for number, pair in enumerate(pairs):
         found = _of_fits(pair.effects, pair.fits, pair.log_evidence)
-        if misfits and (number < _WITH_MISFIT or pair.log_evidence > least):
+        if misfits and (number < IN_FULL or pair.log_evidence > least):
             found, another = left.of_kind(found, list(pair.fits.values()))
             like_two.append(another)
         weighed.append((found, of_pair))

@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.curves import Curve
-from .curve_fits import CurveFit, first_looks, fit_curve, log_integral, log_mean_exp, refined
+from .curve_fits import IN_FULL, CurveFit, first_looks, fit_curve, log_integral, log_mean_exp, refined
 from .discrepancy import FARTHEST_LEVEL, LEVELS, at_most_off, leak_below, leak_density, log_frequency, only
 from .observed import Observed, Point
 
-_IN_FULL = 3  # pairs, the likeliest at first sight, that are settled: with ten the same are named (notebook, ablation)
 _TURNS, _SETTLED = 6, 0.1  # in which two settle, and gain of log evidence that ends them
 _CARRIED = LEVELS.up_to(FARTHEST_LEVEL)
 _VARIANTS = 2  # of an effect beside another, the likeliest at first sight, that are fitted with all levels
@@ -90,7 +89,7 @@ def weigh_pairs(
     companions: dict[str, tuple[float, Point, str]] = {}
     for item in likely:
         companions.setdefault(item[1].effect, item)
-    taken = likely[:_IN_FULL]
+    taken = likely[:IN_FULL]  # with ten the same are named (notebook, ablation)
     taken += [item for item in companions.values() if not any(item is one for one in taken)]
     starts = [(singles[point.effect].best, point, other) for _, point, other in taken]
     start = _together_exactly(observed, singles)

@@ -21,18 +21,15 @@ from .discrepancy import USUAL_LEVEL
 from .inference import Hypothesis
 from .nuisances import Whitening
 from .observed import Observed, Point
-from .search import searched
+from .search import ENOUGH, searched
 from .seen import Blocks, FitTarget, Responder
 
 _MOST_EFFECTS = 4
-# of the best on the grid over none: refinement adds some fifth to it, and far more is needed to be named
-_LEAST_EVIDENCE = 1.0
 _REACH = 0.6  # share of the best evidence from which an effect is refined
 _REACH_CHANCE = 30.0  # log evidence below that
 _REACH_OF_PAIRS = 3.0  # log evidence that a pair may lie below its first effect alone
 # standard deviations at which an effect shows beside none, so that it is tested and refined, and one explanation beside another
 SEEN_FROM = 3.0
-_STARTS = 2
 _OTHER_ONSET = 0.5  # share of the leading evidence from which a start with the other onset is refined as well
 
 
@@ -186,7 +183,7 @@ def _starts_of(fits: Sequence[CurveFit], several: bool) -> list[CurveFit]:
         if item.curve.variant.since != first.curve.variant.since
         and item.log_evidence > _OTHER_ONSET * first.log_evidence
     ]
-    return [first, *(others or ranked[1 : _STARTS if several else 1])[: _STARTS - 1]]
+    return [first, *(others or (ranked[1:] if several else []))[:1]]
 
 
 def tasks_of(hypotheses: Sequence[Hypothesis]) -> list[Task]:
@@ -223,7 +220,8 @@ def _within_reach(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
         (item for item in hypotheses if item.of_catalogue),
         key=lambda item: -item.log_evidence,
     )
-    if not known or known[0].log_evidence < _LEAST_EVIDENCE:
+    # refinement adds some fifth to the evidence of the best on the grid, and far more is needed to be named
+    if not known or known[0].log_evidence < ENOUGH:
         return []
     alone = {item.effects[0]: item.log_evidence for item in known if len(item.effects) == 1}
     top = known[0].log_evidence

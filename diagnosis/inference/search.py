@@ -15,7 +15,10 @@ from .seen import FitTarget
 
 _CENTRINGS, _CENTRED = 3, 0.15  # times that nodes are laid anew, and logarithm of the strength that needs none
 _ROUNDS = 10  # of a search, at the most: it ends where nothing is gained
-_ENOUGH, _ENOUGH_SHARE = 1.0, 1e-5  # gain of log evidence, and share of it, below which the search ends
+ENOUGH, _ENOUGH_SHARE = (
+    1.0,
+    1e-5,
+)  # gain of log evidence, and share of it, that is worth a search, and another step of one
 # share of the gain that straight lines promise, below which slopes are asked anew
 # Source: Nocedal and Wright (2006), Numerical Optimization, algorithm 4.1
 _AS_HOPED = 0.25
@@ -41,7 +44,7 @@ def searched(start: CurveFit, seen: FitTarget) -> tuple[Variant, NDArray[np.floa
     while inner and found is not None and (closer := some.at_smaller_level()) is not None:
         # a law that is more exact than usual is brought nearer than one that is off could tell
         nearer = _Search(like, closer).run(found.variant, found.fit.best, [inner], slopes=found.slopes)
-        if nearer is None or some.evidence(nearer.fit.curve) < some.evidence(found.fit.curve) + _ENOUGH:
+        if nearer is None or some.evidence(nearer.fit.curve) < some.evidence(found.fit.curve) + ENOUGH:
             break
         some, found = closer, nearer
     seen = replace(seen, level=some.level)
@@ -132,7 +135,7 @@ class _Search:
                 before = here
                 here, hoped = self._stepped(before, part, slopes)
                 gained = here.log_evidence - before.log_evidence
-                if gained >= max(_ENOUGH, _ENOUGH_SHARE * before.log_evidence):
+                if gained >= max(ENOUGH, _ENOUGH_SHARE * before.log_evidence):
                     slopes = slopes.learnt(before, here, part) if gained > _AS_HOPED * hoped else None
                 elif learnt:
                     slopes = None

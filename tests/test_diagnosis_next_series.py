@@ -84,7 +84,7 @@ def test_edges_discs_or_flats_are_asked_for_where_blur_of_the_source_ties_with_b
     # flats show a tail by their noise, and the source's blur not at all
     assert found.name in ("discs", "edges", "timed edges", "exposures")
     assert found.separation_then > found.separation + 3.0
-    text = advice_text([found], tuple(first), tuple(second), lately=False)
+    text = advice_text([found], ["focal_spot"], ["mtf_tail"], lately=False)
     titles = [EFFECTS[effect].title for effect in ("focal_spot", "mtf_tail")]
     assert text.startswith(f"{found.what}, which would tell {titles[0]} from {titles[1]} by")
     # the answer's frames are drawn from the generator alone, and hardly matter

@@ -34,9 +34,8 @@ NEXUS_WORDS = frozenset({"NX_class", "default", "signal", "axes", "auxiliary_sig
 
 # a dataset; HDF5 2 would keep 8 MiB of each, and frames are read once and in whole chunks
 _CHUNK_CACHE_BYTES = 2**20
-_ATTRIBUTE_S = (
-    10.0  # of processor time, for what takes microseconds: a heap of texts whose sizes are 0 is read for ever
-)
+# of processor time, for what takes microseconds: a heap of texts whose sizes are 0 is read for ever
+_ATTRIBUTE_S = 10.0
 
 
 def open_hdf5(path: str | os.PathLike[str], *, what: str) -> Any:

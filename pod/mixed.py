@@ -25,9 +25,8 @@ Codes = NDArray[np.intp]
 _FARTHEST = 8.5  # standard deviations to which means over a normal effect are taken
 _STEP, _STEP_OF_LINK = 0.25, 0.4  # widest step of such a mean, in standard deviations and on the link's scale
 _ZERO_SD = 1e-3  # a standard deviation (of eta) below it is reported and treated as 0
-LARGEST_SD = (
-    8.0  # on the link's scale: beyond it a level is all hits or all misses and its spread has no finite estimate
-)
+# on the link's scale: beyond it a level is all hits or all misses and its spread has no finite estimate
+LARGEST_SD = 8.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -30,9 +30,8 @@ _LOW_BAND = 0.25  # cycles a pixel, from which the power at 0 is extrapolated
 _LEAST_GOOD_SHARE = 0.7  # of a square's pixels, for the projection to be as in a whole one
 _LEAST_LEFT = 0.15  # of white noise, after the projection, for a frequency to be used
 _MOST_BROKEN = 256  # squares with bad pixels, from which what such squares show is known well enough
-_SLOPES_FROM_PX = (
-    32  # squares from this side lose slopes too; in smaller ones these hold a quarter of all modes and more
-)
+# squares from this side lose slopes too; in smaller ones these hold a quarter of all modes and more
+_SLOPES_FROM_PX = 32
 
 FloatArray = NDArray[np.float64]
 

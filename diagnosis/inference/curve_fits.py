@@ -13,9 +13,8 @@ from .discrepancy import LEAST_MOVED, LEVELS, Levels, only
 from .observed import Observed, Point
 
 _ROUNDS, _SETTLED = 4, 0.05  # in which a level's best strength is found, and change of its logarithm that ends them
-IN_FULL = (
-    3  # variants of an effect, effects, and pairs, the likeliest at first sight, that are weighed in full, at least
-)
+# variants of an effect, effects, and pairs, the likeliest at first sight, that are weighed in full, at least
+IN_FULL = 3
 _CLOSE = math.log(100.0)  # of log evidence: what is less likely than that changes a mean by less than one per cent
 _WEAK = 0.3  # of the best strength
 IMPLAUSIBLE = 0.01  # probability that an effect is weaker or stronger than its plausible range

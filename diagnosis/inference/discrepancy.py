@@ -77,9 +77,8 @@ EXACT_LAW_ERROR = 0.03  # relative error of probes that a strength is defined by
 LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
 _LEAST_RATIO = 1e-3  # of a misfit over what laws do: shorter ones do not show
 LEAST_MOVED = 0.3  # standard deviations of a probe by which what is random about a law must move one to be carried
-_TIMES_SEEN = (
-    1.5  # what a law predicts in a place over what is seen there, up to which it may be off by a share of itself
-)
+# what a law predicts in a place over what is seen there, up to which it may be off by a share of itself
+_TIMES_SEEN = 1.5
 
 
 def credible(response: NDArray[np.float64], seen: NDArray[np.float64], places: NDArray[np.intp]) -> NDArray[np.float64]:

@@ -25,9 +25,8 @@ from ..session.even_maps import Map, mean_over
 _NODES = 800
 _BEYOND_NODES = 2.0  # times the outermost strengths asked
 _MOST_MOVED = 0.01  # of a series' level, by an effect beside a drifting output: its law is known to a tenth of that
-_NOISIEST = (
-    0.01  # of its level: noise of a frame's mean, beyond which (behind opaque objects) it tells nothing of the output
-)
+# of its level: noise of a frame's mean, beyond which (behind opaque objects) it tells nothing of the output
+_NOISIEST = 0.01
 _LEAST_SERIES = 5
 _LEAST_OPEN = 0.02  # share of the field that lies open in a series whose level tells of the output
 _NEAR_PX = 6  # from an object's outline: where it may really lie, and what its edge spreads

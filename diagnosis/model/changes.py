@@ -58,12 +58,10 @@ ROUGH_FIELDS = 24
 BEYOND_SD = 1.0  # beyond a border: 0 a picture that mirrors there, 1 one that goes on as it ends, 2 an edge that runs straight on
 ROUGH_SHARE = 0.9  # of the local slope: rendering along an edge, from place to place
 SPREAD_SD = 0.05  # of the calibrated optical spread: calibration may have taken in an effect
-TEXTURE_SD = (
-    0.003  # of the correlation of neighbours at each lag, the same in all series, and as much again in those of a kV
-)
-READ_TEXTURE_SD = (
-    0.05  # of the read noise's correlation at each lag: what an amplifier keeps that settles for three time constants
-)
+# of the correlation of neighbours at each lag, the same in all series, and as much again in those of a kV
+TEXTURE_SD = 0.003
+# of the read noise's correlation at each lag: what an amplifier keeps that settles for three time constants
+READ_TEXTURE_SD = 0.05
 # always there a little, without being an effect: limits of the catalogue's table; beyond them the effect of that kind begins
 SHAPE_SD = 0.0005  # rms over the field of the smooth change of the open field's shape: of a series, and of all since the calibration
 SHAPE_ORDER = 4  # of the polynomials that stand for it, each order half as likely as the one of half its number

@@ -18,9 +18,8 @@ from .calibrated_maps import CalibratedMaps
 from .changes import DUST_LIMIT
 
 _LEAST_SCENES, _NEARLY_ALWAYS = 4, 0.9  # unlike objects, and share of their series, that show what is the panel's own
-_NEARLY_WHOLE = (
-    0.75  # share of a block that stands out: its corner of a tile is a quarter, a cluster of 6 x 6 defects 0.56
-)
+# share of a block that stands out: its corner of a tile is a quarter, a cluster of 6 x 6 defects 0.56
+_NEARLY_WHOLE = 0.75
 _MOST_OUTLYING = 0.1  # share of the pixels; more of them are a pattern
 
 

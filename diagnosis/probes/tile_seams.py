@@ -16,9 +16,8 @@ from ..session.summaries import BLOCK_PX
 
 _BESIDE_PX = 4  # lines whose mean is taken, two means to either side of a border
 _MEDIAN, _QUARTILE = 0.4549, 1.3233  # of chi square of one degree of freedom, the quartile being the upper one
-_EFFICIENCY = (
-    0.60  # of a variance from squares' upper quartile, which a blemish leaves alone, against one from their mean
-)
+# of a variance from squares' upper quartile, which a blemish leaves alone, against one from their mean
+_EFFICIENCY = 0.60
 _LEAST_SIDE_PX = 2 * BLOCK_PX  # of a tile: narrower ones are a pattern of pixels
 
 

@@ -31,9 +31,8 @@ from ...errors import InputError
 from ..line.line_state import FloatArray, LineContext, LineState, needed
 from .effect import Effect, Grid, Parameter, Reading, Shows, Variation
 
-_NEAR_GAUSSIAN = (
-    0.02  # so little below 0 the first order of peakedness is enough: the transfer is off by less than 3e-4
-)
+# so little below 0 the first order of peakedness is enough: the transfer is off by less than 3e-4
+_NEAR_GAUSSIAN = 0.02
 # mm, to each side of the panel: a third of the plausible range
 _SIDES = ((-5.0, 0.0), (5.0, 0.0), (0.0, -5.0), (0.0, 5.0))
 _RING = -0.5  # peakedness of a source that is its rim alone; no even profile is flatter

@@ -7,9 +7,8 @@ from numba import njit, prange
 
 MOMENTS = 4  # weights a call sums; fewer are padded with zeros
 TOGETHER = 4  # energies a pass over a tile takes: loads and stores of the sums are shared
-FEW_TERMS = (
-    1_000_000  # pixels times energies: half a millisecond's work, and threads may take 6 ms to start on busy cores
-)
+# pixels times energies: half a millisecond's work, and threads may take 6 ms to start on busy cores
+FEW_TERMS = 1_000_000
 _TILE = 512  # pixels a thread takes at a time: sums and thicknesses stay in the nearest cache
 # no NaN and no infinity reaches the kernel, but the flags that would assume it are left out: -inf may pass max()
 _FAST = {"contract", "nsz", "reassoc", "arcp"}

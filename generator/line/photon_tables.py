@@ -32,9 +32,8 @@ NODES_KV: NDArray[np.float64] = np.concatenate(
     [0.05 * np.arange(200, 600), 0.1 * np.arange(300, 600), 0.25 * np.arange(240, 1201)]
 )
 LOG_THICKNESS = np.linspace(-1.6, 1.6, 33)  # nodes of the scintillator thickness
-_LOWEST_KEV = (
-    5.0  # below, layers that nobody stated count as here: nothing passes a window, and no layer may let through more
-)
+# below, layers that nobody stated count as here: nothing passes a window, and no layer may let through more
+_LOWEST_KEV = 5.0
 _LARGEST_DEPARTURE = 0.1  # between attenuation tables; more is an edge at another place
 _LARGEST_MODEL_RATIO = 0.15  # logarithm of one spectrum model over the other; more is the last bin at the end point
 

@@ -59,6 +59,7 @@ def diagnosis(verdict, **more):
         "probability_no_gap": 0.0,
         "probability_unknown": 0.91,
         "unknown_location": "position of flat",
+        "hypotheses": (),
         "compared": SimpleNamespace(views=views),
     }
     fields |= more
@@ -117,6 +118,32 @@ def test_the_printed_answer_is_a_headline_a_table_and_a_sentence_a_line():
     assert lines[6] == f"Strength (radiation scattered by the object): {means}."
     assert lines[-2].endswith("by 82 % (75 to 90) of what is above noise.")
     assert lines[-1] == "Three series moved."
+
+
+def test_what_is_less_likely_but_not_out_of_the_question_is_said():
+    glare = cause("veiling_glare", 1.0, (2.0, 1.5, 2.5))
+    spot = cause("focal_spot", 0.46, (0.51, 0.4, 0.65), unit="mm")
+    weak = cause("heel", 0.04, (3.0, 2.0, 4.0))
+    told = answer_text(diagnosis("explained", causes=(glare, spot, weak), named=("veiling_glare",)))
+    shown = (
+        f"{title_of('focal_spot')}, 0.510 mm (0.400 to 0.650), probability 0.46; {title_of(UNKNOWN)}, probability 0.91."
+    )
+    assert f"Less likely, but not out of the question: {shown}" in told.splitlines()
+    alone = answer_text(diagnosis("explained", causes=(glare,), named=("veiling_glare",), probability_unknown=0.01))
+    assert "Less likely" not in alone
+
+
+def test_an_unknown_effect_that_hardly_leads_is_said_beside_what_the_catalogue_has():
+    weighed = [
+        Hypothesis(effects=effects, probability=probability, log_evidence=0.0)
+        for effects, probability in (((UNKNOWN,), 0.51), (("line_flicker",), 0.44), ((), 0.01))
+    ]
+    text = verdict_text(diagnosis("unknown_effect", probability_unknown=0.51, hypotheses=tuple(weighed)))
+    flicker = title_of("line_flicker")
+    assert (
+        f"The catalogue explains it less well (probability 0.51 of an effect that is not in the catalogue): {flicker} (0.44)."
+        in text
+    )
 
 
 def test_an_unknown_effect_has_its_place_and_signature_in_words():

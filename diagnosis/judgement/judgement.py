@@ -363,8 +363,8 @@ def _beyond_plausible(leading: Hypothesis) -> tuple[str, ...]:
         if not variant.low <= point.strength <= variant.high:
             side = "weaker" if point.strength < variant.low else "stronger"
             notes.append(
-                f"{point.effect} is {side} than what is plausible as a rule ({known.low:g} to {known.high:g} {known.unit}): such a"
-                " strength was given little weight beforehand"
+                f"{title_of(point.effect)}: {side} than what is plausible as a rule ({known.low:g} to {known.high:g} {known.unit});"
+                " such a strength was given little weight beforehand"
             )
     return tuple(notes)
 

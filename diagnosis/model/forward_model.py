@@ -143,9 +143,9 @@ def _mean_shift_px(effects: Sequence[AppliedEffect], twin: Twin, request: Series
     """How far effects displace a scene on average that registration finds, and that are no displacements themselves."""
     down, right = 0.0, 0.0
     for item in effects:
-        mean_shift = EFFECTS[item.id].mean_shift
-        if mean_shift is not None and (item.since == "always" or request.after_calibration):
-            of_one = mean_shift(item.parameters, request, twin)
+        effect = EFFECTS[item.id]
+        if effect.mean_shift is not None and (item.since == "always" or request.after_calibration):
+            of_one = effect.mean_shift(effect.values(item.parameters), request, twin)
             down, right = down + of_one[0], right + of_one[1]
     return down, right
 

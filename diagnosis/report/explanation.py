@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from ...checks.findings import FindingCode
 from ...generator.effects import EFFECTS
 from ...results import Table
-from ..inference.inference import title_of
+from ..inference.inference import UNKNOWN, title_of
 from ..judgement.answer import EXPLAINED, Diagnosis, Place
 from ..judgement.held_out import Gap
 from .words import axis_text, family_text, meaning_text, nuisance_text, place_text, share_text, strength_text, when_text
@@ -95,7 +95,8 @@ def answer_text(diagnosis: Diagnosis) -> str:
         lines += [*(item.line for item in diagnosis.findings), "All else is of the other series."]
     if _explained(diagnosis):
         lines += _where(diagnosis.where)
-        lines += [_causes(diagnosis).as_text(widest=_WIDE), *_meanings(diagnosis), *_fall(diagnosis)]
+        lines += [_causes(diagnosis).as_text(widest=_WIDE), *_meanings(diagnosis)]
+        lines += [*_less_likely(diagnosis), *_fall(diagnosis)]
     else:
         lines += _not_explained(diagnosis)
     if diagnosis.not_tested or diagnosis.warnings:
@@ -223,8 +224,7 @@ def _not_explained(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.verdict == "unknown_effect":
         return [
             *_where(diagnosis.where),
-            "No effect of the catalogue, and no pair of them, explains it (probability"
-            f" {diagnosis.probability_unknown:.2f} of an effect that is not in the catalogue).",
+            _unknown(diagnosis),
             *_signature(diagnosis),
             figures,
         ]
@@ -236,6 +236,28 @@ def _not_explained(diagnosis: Diagnosis) -> list[str]:
         figures,
         *([f"To distinguish them: {measure['text']}."] if measure else []),
     ]
+
+
+def _unknown(diagnosis: Diagnosis) -> str:
+    """How probable an effect outside the catalogue is, and what else is not out of the question."""
+    unknown = f"probability {diagnosis.probability_unknown:.2f} of an effect that is not in the catalogue"
+    others = [(title, probability) for title, probability in rivals(diagnosis) if title != title_of(UNKNOWN)]
+    if not others:
+        return f"No effect of the catalogue, and no pair of them, explains it ({unknown})."
+    return f"The catalogue explains it less well ({unknown}): {', '.join(f'{title} ({p:.2f})' for title, p in others)}."
+
+
+def _less_likely(diagnosis: Diagnosis) -> list[str]:
+    """What else may be there, beside or instead of what is named, in one sentence."""
+    others = [cause for cause in diagnosis.causes if cause not in diagnosis.leading]
+    told = [
+        f"{title_of(cause.effect)}, {strength_text(cause)}, probability {cause.probability:.2f}"
+        for cause in others
+        if cause.probability >= _LEAST_LIKELY
+    ]
+    if diagnosis.probability_unknown >= _LEAST_LIKELY:
+        told.append(f"{title_of(UNKNOWN)}, probability {diagnosis.probability_unknown:.2f}")
+    return [f"Less likely, but not out of the question: {'; '.join(told)}."] if told else []
 
 
 def _fall(diagnosis: Diagnosis) -> list[str]:

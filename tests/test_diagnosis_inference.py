@@ -18,7 +18,7 @@ from raytwin.diagnosis.inference.curve_fits import (
 )
 from raytwin.diagnosis.inference.discrepancy import LEVELS, group_factors
 from raytwin.diagnosis.inference.in_series import in_some_series
-from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, Priors, _singles, weigh_hypotheses
+from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, Priors, _singles, title_of, weigh_hypotheses
 from raytwin.diagnosis.inference.inner_parameters import with_inner_open
 from raytwin.diagnosis.inference.nuisances import LocalNuisances, Nuisances, Whitening, local_columns
 from raytwin.diagnosis.inference.observed import Observed, Point
@@ -817,7 +817,9 @@ def test_a_strength_beyond_its_plausible_range_is_told(strength, told):
         variants={"veiling_glare": curve},
     )
     notes = _beyond_plausible(named)
-    assert [f"veiling_glare is {told} than" in note and "0.5 to 5 %" in note for note in notes] == [True] * bool(told)
+    assert [f"{title_of('veiling_glare')}: {told} than" in note and "0.5 to 5 %" in note for note in notes] == [
+        True
+    ] * bool(told)
 
 
 def test_of_two_variants_with_one_name_each_keeps_its_own_curve():

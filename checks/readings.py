@@ -111,7 +111,12 @@ def reading_of(item: Series, frames: FloatArray, acquisition: AcquisitionFile, *
         if len(steps) > 3:
             # a ghost of the exposure before that fades is no noise: it bends little, and less and less
             steps, scale = np.diff(steps, axis=0)[len(steps) // 2 :], 6.0
-        variance = np.asarray(np.mean(steps**2, axis=0) / scale * item.averaged, dtype=np.float64)
+        variance = np.mean(steps**2, axis=0) / scale * item.averaged
+        # what lines share is no noise of quanta; it follows the light where there is any
+        picture = frames.mean(axis=0)
+        middle = float(picture.mean())
+        follows = (picture / middle) ** 2 if item.kind != "dark" and middle > 0.0 else 1.0
+        variance = np.asarray(variance - _of_lines(steps) / scale * item.averaged * follows, dtype=np.float64)
     load = None
     if item.power_W is not None:
         load = ("power_W", item.power_W)
@@ -149,6 +154,18 @@ def _without_common(steps: FloatArray, picture: FloatArray) -> FloatArray:
     if power <= 0:
         return steps
     return np.asarray(steps - (np.sum(steady * shape, axis=(1, 2)) / power)[:, None, None] * shape)
+
+
+def _of_lines(steps: FloatArray) -> float:
+    """Variance that steps (step, row, column) of the pixels of a line share, rows and columns together: covariance of the means of
+    a line's two halves, which no light spreads between. 0 where that is below 0."""
+    low, high = np.quantile(steps, [0.05, 0.95], axis=(1, 2), keepdims=True)
+    steady = np.clip(steps, low - (high - low), high + (high - low))
+    shared = 0.0
+    for lines in (steady, steady.swapaxes(1, 2)):
+        half = lines.shape[2] // 2
+        shared += max(float(np.mean(lines[..., :half].mean(axis=2) * lines[..., half:].mean(axis=2))), 0.0)
+    return shared
 
 
 def mean_of(image: FloatArray | None, good: NDArray[np.bool_]) -> float:

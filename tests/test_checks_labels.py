@@ -430,13 +430,38 @@ def test_what_all_scenes_at_one_gap_want_is_no_fault_of_their_maps():
     assert len(factors_of(wedge_a=(700.0, 1.4), wedge_b=(700.0, 1.0), **far)) == 2
 
 
+OF_60_KV = SimpleNamespace(
+    kind="flat",
+    averaged=1,
+    kV=60.0,
+    filters=(),
+    power_W=20.0,
+    current_mA=None,
+    exposure_ms=20.0,
+    source_detector_mm=None,
+)
+ANYWHERE = SimpleNamespace(instrument=SimpleNamespace(source_detector_mm=1000.0))
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_what_lines_share_is_no_noise_that_labels_are_judged_by(axis):
+    """Half of a field lies behind something; lines flicker by as much as their pixels' noise, with the light."""
+    rng = np.random.default_rng(7)
+    picture = np.where(np.arange(64) < 32, 10_000.0, 6000.0) * np.ones((64, 1))
+    shape = [12, 64, 64]
+    shape[3 - axis] = 1
+    noise = np.sqrt(picture) * rng.standard_normal((12, 64, 64))
+    flickering = picture * (1.0 + 0.01 * rng.standard_normal(shape)) + noise
+    found = reading_of(OF_60_KV, flickering, ANYWHERE, since=False).variance_DN2
+    steady = reading_of(OF_60_KV, picture + noise, ANYWHERE, since=False).variance_DN2
+    assert float(found.mean()) == pytest.approx(float(steady.mean()), rel=0.12)
+    assert float(steady.mean()) == pytest.approx(8000.0, rel=0.03)
+
+
 def test_copies_of_frames_leave_the_noise_that_labels_are_judged_by():
     rng = np.random.default_rng(6)
     drawn = 1000.0 + 5.0 * rng.standard_normal((8, 64, 64))
-    acquisition = SimpleNamespace(instrument=SimpleNamespace(source_detector_mm=1000.0))
-    series = SimpleNamespace(
-        averaged=1, kV=60.0, filters=(), power_W=20.0, current_mA=None, exposure_ms=20.0, source_detector_mm=None
-    )
+    acquisition, series = ANYWHERE, OF_60_KV
     plain = reading_of(series, drawn[:4], acquisition, since=False)
     copied = reading_of(series, drawn[[0, 1, 1, 2, 2, 2, 3, 3]], acquisition, since=False)
     assert (plain.frames, copied.frames) == (4, 4)

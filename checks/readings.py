@@ -113,10 +113,9 @@ def reading_of(item: Series, frames: FloatArray, acquisition: AcquisitionFile, *
             steps, scale = np.diff(steps, axis=0)[len(steps) // 2 :], 6.0
         variance = np.mean(steps**2, axis=0) / scale * item.averaged
         # what lines share is no noise of quanta; it follows the light where there is any
-        picture = frames.mean(axis=0)
-        middle = float(picture.mean())
-        follows = (picture / middle) ** 2 if item.kind != "dark" and middle > 0.0 else 1.0
-        variance = np.asarray(variance - _of_lines(steps) / scale * item.averaged * follows, dtype=np.float64)
+        picture = np.asarray(frames.mean(axis=0), dtype=np.float64)
+        light = np.ones_like(picture) if item.kind == "dark" else picture
+        variance = np.asarray(variance - _of_lines(steps, light) / scale * item.averaged * light**2, dtype=np.float64)
     load = None
     if item.power_W is not None:
         load = ("power_W", item.power_W)
@@ -156,15 +155,19 @@ def _without_common(steps: FloatArray, picture: FloatArray) -> FloatArray:
     return np.asarray(steps - (np.sum(steady * shape, axis=(1, 2)) / power)[:, None, None] * shape)
 
 
-def _of_lines(steps: FloatArray) -> float:
-    """Variance that steps (step, row, column) of the pixels of a line share, rows and columns together: covariance of the means of
-    a line's two halves, which no light spreads between. 0 where that is below 0."""
+def _of_lines(steps: FloatArray, light: FloatArray) -> float:
+    """Variance that steps (step, row, column) of the pixels of a line share, over the square of the light (row, column), of rows and
+    columns together: covariance of the means of a line's two halves, which no light spreads between. None below 0."""
     low, high = np.quantile(steps, [0.05, 0.95], axis=(1, 2), keepdims=True)
     steady = np.clip(steps, low - (high - low), high + (high - low))
     shared = 0.0
-    for lines in (steady, steady.swapaxes(1, 2)):
+    for lines, shown in ((steady, light), (steady.swapaxes(1, 2), light.T)):
         half = lines.shape[2] // 2
-        shared += max(float(np.mean(lines[..., :half].mean(axis=2) * lines[..., half:].mean(axis=2))), 0.0)
+        if half == 0:
+            continue  # lines of one pixel have no halves
+        both = float(np.mean(shown[:, :half].mean(axis=1) * shown[:, half:].mean(axis=1)))
+        covariance = float(np.mean(lines[..., :half].mean(axis=2) * lines[..., half:].mean(axis=2)))
+        shared += max(covariance, 0.0) / both if both > 0.0 else 0.0
     return shared
 
 

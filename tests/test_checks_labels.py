@@ -454,8 +454,18 @@ def test_what_lines_share_is_no_noise_that_labels_are_judged_by(axis):
     flickering = picture * (1.0 + 0.01 * rng.standard_normal(shape)) + noise
     found = reading_of(OF_60_KV, flickering, ANYWHERE, since=False).variance_DN2
     steady = reading_of(OF_60_KV, picture + noise, ANYWHERE, since=False).variance_DN2
-    assert float(found.mean()) == pytest.approx(float(steady.mean()), rel=0.12)
+    assert float(found.mean()) == pytest.approx(float(steady.mean()), rel=0.06)
     assert float(steady.mean()) == pytest.approx(8000.0, rel=0.03)
+
+
+@pytest.mark.parametrize("shape", [(12, 1, 64), (12, 64, 1), (12, 64, 64)])
+def test_lines_of_one_pixel_and_frames_without_light_have_noise_as_well(shape):
+    noise = 3.0 * np.random.default_rng(8).standard_normal(shape)
+    drawn, none = (
+        reading_of(OF_60_KV, frames, ANYWHERE, since=False).variance_DN2 for frames in (1000.0 + noise, np.zeros(shape))
+    )
+    assert float(drawn.mean()) == pytest.approx(9.0, rel=0.4)
+    np.testing.assert_array_equal(none, np.zeros(shape[1:]))
 
 
 def test_copies_of_frames_leave_the_noise_that_labels_are_judged_by():

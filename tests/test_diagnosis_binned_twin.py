@@ -58,14 +58,16 @@ def test_maps_and_levels_are_those_of_averaged_frames(both):
         assert here.rate_DN_per_mAs.value == pytest.approx(there.rate_DN_per_mAs.value, rel=1e-3)
         # either fit knows its slope to 1 %
         assert here.photon_transfer_slope_DN.value == pytest.approx(there.photon_transfer_slope_DN.value, rel=0.03)
-        assert here.gain_DN.value == pytest.approx(there.gain_DN.value, rel=0.03)
+        # few squares leave open how far light spreads among them
+        assert there.gain_DN.low < here.gain_DN.value < there.gain_DN.high
         np.testing.assert_allclose(here.flat_shape[good], there.flat_shape[good], rtol=2e-3)
 
 
 def test_light_spreads_over_as_much_less_of_a_square(both):
     _, squares, averaged = both
     left = [twin.noise.spread.value.variance_share for twin in (squares, averaged)]
-    assert left[0] == pytest.approx(left[1], rel=0.03)
+    gain = averaged.levels[0].gain_DN  # known no better than the share that it comes from
+    assert left[0] == pytest.approx(left[1], rel=(gain.high - gain.low) / (2.0 * gain.value))
     width = squares.noise.spread.intervals["sigma_px"]
     assert width.low <= width.value <= width.high
 

@@ -163,11 +163,14 @@ def prepare_session(
 
 
 def _taken_in(twin: Twin, factor: int) -> tuple[str, ...]:
-    """What calibration took in that the catalogue has as an effect; factor: pixels along the side of the twin's squares."""
+    """What calibration took in that the catalogue has as an effect; factor: pixels along the side of the twin's squares.
+
+    A tail that the calibrating series leave open, its interval down to none, is none that was found.
+    """
     spread = twin.noise.spread
-    if spread.value.tail_share == 0.0:
-        return ()
     known = spread.intervals.get("tail_share")
+    if spread.value.tail_share == 0.0 or (known is not None and known.low <= 0.0):
+        return ()
     within = "" if known is None else f" (95 %: {100.0 * known.low:.2g} to {100.0 * known.high:.2g})"
     light, reach_px = 100.0 * spread.value.tail_share, factor * spread.value.tail_px
     return (

@@ -118,10 +118,13 @@ def run(arguments: argparse.Namespace) -> int:
         text = "\n".join([table_text(found.distinguishability), *missing])
         answer(found.to_dict(), as_json=arguments.json, text=text)
         return 0
+    if arguments.json:  # the text has these and the notes
+        for item in found.findings:
+            say(f"finding: {item.line}")
     for line in found.warnings:
         say(f"not used: {line}")
-    if arguments.json:  # the text has these
-        for line in (*(f"finding: {item.line}" for item in found.findings), *found.notes):
+    if arguments.json:
+        for line in found.notes:
             say(line)
     text = answer_text(found)
     if found.task is not None:

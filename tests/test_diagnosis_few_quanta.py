@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from raytwin.diagnosis.probes.noise_tails import enough_quanta, tails_of_quanta
+from raytwin.diagnosis.probes.probes import FLOORS
 from raytwin.diagnosis.probes.scalar_context import Areas
 from raytwin.diagnosis.session.summaries import summarise_series
 
@@ -41,7 +42,7 @@ def test_tails_are_not_asked_for_where_a_part_of_the_field_counts_nothing():
     quanta = np.full(SHAPE, 400.0)
     quanta[:7] = 0.0
     expected, summary = counted(quanta)
-    assert abs(summary.kurtosis_excess - tails_of_quanta(expected, AREAS)) > 0.1
+    assert abs(summary.kurtosis_excess - tails_of_quanta(expected, AREAS)) > FLOORS["kurtosis"]
     assert not enough_quanta(expected, AREAS, summary)
     # read noise of a panel hides them
     panel = counted(quanta, gain=0.5, read=3.0)

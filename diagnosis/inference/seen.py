@@ -46,7 +46,9 @@ class Blocks:
         """
         of_block = np.maximum(np.bincount(self.of, weights=tells, minlength=len(self.costs)), 0.0)
         kept = self.costs < 0.1 * self.costs.max()
-        for block in np.argsort(-of_block / self.costs):
+        # a series without probes costs nothing
+        worth = np.divide(of_block, self.costs, out=np.zeros(len(of_block)), where=self.costs > 0.0)
+        for block in np.argsort(-worth):
             if float(of_block[kept].sum()) >= _TELLS * float(of_block.sum()):
                 break
             kept[block] = True

@@ -18,7 +18,7 @@ from ..probes.registration import Placement
 from ..probes.scalar_context import ScalarContext
 from ..session.even_maps import NOWHERE, Map, compact, mean_over
 from ..session.session import SessionSeries
-from ..session.summaries import CODES_FRAMES, LEAST_NOISE_DN2, SeriesSummary
+from ..session.summaries import CODES_FRAMES, LEAST_NOISE_DN2, SeriesSummary, rounded_away
 from ..session.usable import SeenSeries, counted_copies
 from .calibrated_maps import LEAST_GAIN, CalibratedMaps, exposure_of
 from .changes import DUST_LIMIT, Change
@@ -310,7 +310,8 @@ def session_model(
             clean,
             signal_DN=signals_DN[item.name],
             previous_DN=before,
-            code_range=summaries[item.name].code_range,
+            summary=summaries[item.name],
+            counting=bool(model.base.instrument.counting),
             counts_all=item.name == counting,
             repeatable=copies[item.name][1] if item.name in copies else 0,
             later_darks=tuple(
@@ -344,7 +345,8 @@ def _context(
     *,
     signal_DN: float,
     previous_DN: float | None,
-    code_range: int,
+    summary: SeriesSummary,
+    counting: bool,
     counts_all: bool,
     repeatable: int,
     later_darks: tuple[tuple[int, int], ...],
@@ -371,7 +373,9 @@ def _context(
         previous_signal_DN=previous_DN,
         calibrates=item.calibrates,
         codes_usable=kind in ("dark", "flat")
-        and 0 < code_range < _CODES_SHARE * clean.sum() * min(frames, CODES_FRAMES),
+        and 0 < summary.code_range < _CODES_SHARE * clean.sum() * min(frames, CODES_FRAMES),
+        # a counter's numbers are its quanta
+        rounded=not counting and rounded_away(summary, clean),
         pattern_noise=noise,
         quantum_DN2=mean_over(expected.quantum_variance_DN2, clean),
         dark_DN=mean_over(expected.dark_DN, clean),

@@ -67,9 +67,10 @@ def measured_scalars(
     found.trends()
     found.afterglow(dark_mean_DN)
     found.codes()
-    if pattern is not None and not context.calibrates:
+    stands = context.calibrates or context.rounded
+    if pattern is not None and not stands:
         found.fixed_pattern(pattern)
-    if outliers is not None and not context.calibrates:
+    if outliers is not None and not stands:
         found.add("tails", OUTLIERS, "sqrt(pixels)", root_of_count(outliers), COUNT_SD, "pixels")
         if memory is not None and memory[1] >= _LEAST_OUTLIERS and summary.frames >= _LEAST_FRAMES:
             share, count = memory
@@ -136,8 +137,11 @@ class _Found:
     def noisy(self) -> bool:
         """Whether frames have noise of their own.
 
-        A picture that fades without any noise says how fast it fades, which the afterglow's levels say without a law's errors.
+        Rounded ones have what their pixels' distances from the next code make of it. A picture that fades without any noise
+        says how fast it fades, which the afterglow's levels say without a law's errors.
         """
+        if self.context.rounded:
+            return False
         return self.context.kind != "afterglow" or sum(self.means_DN2) > LEAST_NOISE_DN2
 
     def shared(self, quantum_DN2: float, white_DN2: float) -> float:

@@ -124,8 +124,10 @@ class MapProjection:
     def column_noise(self, sd_DN: NDArray[np.floating]) -> NDArray[np.float64]:
         """The same of noise that each column has in common."""
         sd = np.asarray(sd_DN, dtype=np.float32)
-        sums = np.stack([np.sum(row.reshape(self._shape) * sd, axis=0, dtype=np.float64) for row in self._rows])
-        return np.asarray(np.sum(sums**2, axis=1))
+        result = np.empty(len(self))
+        for number, row in enumerate(self._rows):
+            result[number] = np.sum(np.sum(row.reshape(self._shape) * sd, axis=0, dtype=np.float64) ** 2)
+        return result
 
     def line_noise(self) -> NDArray[np.float64]:
         """Variance (2, probe) that noise of 1 DN, common to each row and then common to each column, gives the projections."""

@@ -15,7 +15,7 @@ from .lasting import BY_CHANCE, chance_in_flat, chances
 from .line_scalars import LineNoise, line_pattern
 from .moving_picture import MovingPicture, lag_loss
 from .noise_correlation import autocovariance, correlation_sum
-from .noise_tails import tails_of_quanta, tails_of_rounding
+from .noise_tails import tails_of_quanta
 from .probes import (
     FIXED,
     FIXED_BLOCKS,
@@ -112,9 +112,7 @@ def _noise_scalars(expected: ExpectedSeries, context: ScalarContext, profile: ND
     for step in (1, 2):
         correlation = float(temporal[step - 1]) if temporal.size >= step else 0.0
         values[f"temporal_correlation {step}"] = (correlation * mean_q + moving.lasting(step)) / full
-    values["kurtosis"] = (
-        tails_of_rounding(expected, context, full) + moving.kurtosis(expected) + tails_of_quanta(expected, areas)
-    )
+    values["kurtosis"] = moving.kurtosis(expected) + tails_of_quanta(expected, areas)
     if context.kind in ("flat", "object"):
         quantum = (mean_q * keep * correlation_sum(expected, rows, columns) + mean_w) / areas.order.size
         quantum += lines.frame(rows, columns)

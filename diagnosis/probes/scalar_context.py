@@ -72,7 +72,8 @@ class ScalarContext:
     """What scalar probes of a series refer to; the same for measured frames and forward model.
 
     Fields: kind; frames; good (row, column); labels (row, column); label_names; reference_signal_DN: mean signal of the
-    base model (1 for darks); previous_signal_DN: of the exposure before an afterglow; calibrates; codes_usable; pattern_noise: what
+    base model (1 for darks); previous_signal_DN: of the exposure before an afterglow; calibrates; codes_usable; rounded: to steps
+    that the noise hardly reaches over; pattern_noise: what
     noise alone leaves of a pattern in the corrected mean frame; quantum_DN2: the base model's quantum variance of one frame;
     dark_DN: the base model's mean dark;
     counts_all_outliers: this series stands for all, where pixels are counted that stand out anywhere; gain (row, column):
@@ -96,6 +97,7 @@ class ScalarContext:
     quantum_DN2: float
     dark_DN: float
     counts_all_outliers: bool
+    rounded: bool = False
     gain: NDArray[np.floating] | None = None
     averaged: int = 1
     whole_lines: bool = True

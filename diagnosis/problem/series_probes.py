@@ -22,7 +22,7 @@ from ..probes.probes import ProbeName, Scalar
 from ..probes.registration import RENDER_SHARE, render_variance
 from ..probes.straight_edge import covered_scene, distance_px, scatter_share
 from ..session.even_maps import NEIGHBOURS_PX, Map, full_size, local_range, near_steps, signal_map
-from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
+from ..session.summaries import LEAST_NOISE_DN2, ROUNDED_SHARE, SeriesSummary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -212,7 +212,8 @@ def series_probes(
     first = [(variant, moved[rows.start]) for variant, rows in zip(variants, strength_rows(variants), strict=True)]
     projection = MapProjection(
         _templates(session, one, frame, [(variant, found[0]) for variant, found in first if found is not None]),
-        mask=frame.mask,
+        # where numbers stand still the mean jumps from code to code with the level
+        mask=frame.mask & ~_standing_still(summary) if one.context.rounded else frame.mask,
         quantum_DN2=frame.quantum_DN2,
         white_DN2=frame.white_DN2,
         autocovariance_table=one.expected.noise_autocovariance,
@@ -260,6 +261,13 @@ def series_probes(
         shrink=np.concatenate([1.0 / np.sqrt(1.0 + beyond), np.ones(len(scalars))]),
         rendered=frame.rendered,
     )
+
+
+def _standing_still(summary: SeriesSummary) -> NDArray[np.bool_]:
+    """Pixels (row, column) whose noise hardly reaches over a step of the ADC, by what their neighbours do as well."""
+    from scipy.ndimage import uniform_filter
+
+    return np.asarray(uniform_filter(summary.unchanged_share, NEIGHBOURS_PX) > ROUNDED_SHARE)
 
 
 def _templates(

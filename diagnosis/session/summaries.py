@@ -19,8 +19,11 @@ LAGS: tuple[tuple[int, int], ...] = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2
 BLOCK_PX = 8  # side of the blocks whose means show slow texture
 LEAST_NOISE_DN2 = 1e-4  # of a pixel: noise below the ADC's step can vanish, and a simulated dark may have none
 PIECE_FRAMES = 64  # at most, that are looked at together: each pixel is scaled by its own variance within them
-_QUIET = 0.01  # of the mean variance, below which a pixel may be one that never leaves its code
 CODES_FRAMES = 16  # the first, in which codes are counted
+
+# of steps from frame to frame that change nothing: Gaussian noise of 0.7 steps of the ADC; of wider noise rounding leaves a Gaussian
+# (excess kurtosis below 0.02 in 16 frames and more) whose variance does not depend on where values lie between codes (0.1 %)
+ROUNDED_SHARE = 0.37
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +38,7 @@ class SeriesSummary:
     of BLOCK_PX; temporal_covariance_DN2 (2,): mean product of a pixel's deviations one and two frames apart;
     kurtosis_excess of differences, pooled over standardised pixels; frame_mean_DN (n,); distinct_codes,
     code_range: how many whole numbers occur between the 1st and 99th percentile, and how many there are from the first
-    to the last of them.
+    to the last of them; unchanged_share (row, column): of a pixel's steps from frame to frame, those that change nothing.
     """
 
     frames: int
@@ -54,6 +57,7 @@ class SeriesSummary:
     frame_mean_DN: NDArray[np.float64]
     distinct_codes: int
     code_range: int
+    unchanged_share: NDArray[np.float32]
 
     def without_lines(self, rows_DN2: float, columns_DN2: float) -> "SeriesSummary":
         """What the frames would say without offsets of rows and columns of these variances (DN^2), new in every frame.
@@ -244,7 +248,9 @@ def summarise_series(
     column_count = np.maximum(use.sum(axis=0), 1.0)
     code_parts: list[NDArray[Any]] = []  # whole numbers alone: others have no codes
     coded = 0
+    unchanged = np.zeros(shape, np.float32)
     for raw, x, cleaned, d in _pieces(pieces, good, pattern, name):
+        unchanged += np.count_nonzero(raw[1:] == raw[:-1], axis=0)
         if raw.dtype.kind in "ui" and coded < CODES_FRAMES:
             code_parts.append(raw[: CODES_FRAMES - coded][:, good].ravel())
             coded += min(len(raw), CODES_FRAMES - coded)
@@ -254,7 +260,6 @@ def summarise_series(
         if len(d):
             if len(d) > 3:
                 inside = (d * d)[:, good] / np.maximum(d2 / len(d), 1e-12)[good]
-                inside[:, _standing_still(raw, d2, good)] = 0.0
                 pair_fourth += float(np.sum(inside * inside))
                 pair_second += float(inside.size)
             for index, (first, second, selected) in enumerate(pairs_of_lag):
@@ -301,6 +306,7 @@ def summarise_series(
         frame_mean_DN=np.concatenate(frame_means),
         distinct_codes=distinct,
         code_range=span,
+        unchanged_share=unchanged / one,
     )
 
 
@@ -311,13 +317,9 @@ def _codes(values: NDArray[np.integer[Any]]) -> tuple[int, int]:
     return there.size, int(there[-1]) - int(there[0]) + 1
 
 
-def _standing_still(raw: NDArray[Any], d2: NDArray[np.float32], good: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Good pixels (numbers among them) whose code never changes: the common factor that was taken out is no noise of theirs."""
-    squares = d2[good]
-    quiet = np.flatnonzero(squares < _QUIET * float(squares.mean()))
-    codes = raw.reshape(len(raw), -1)[:, np.flatnonzero(good)[quiet]]
-    # at the end of the range a pixel stands still because it is saturated
-    return np.asarray(quiet[np.all(codes == codes[:1], axis=0) & (codes[0] < raw.max())])
+def rounded_away(summary: SeriesSummary, good: NDArray[np.bool_]) -> bool:
+    """Whether most of what the noise of the good pixels (row, column) would do is lost in the steps of the ADC."""
+    return float(np.mean(summary.unchanged_share[good])) > ROUNDED_SHARE
 
 
 def kurtosis_excess(fourth: float, count: float, pairs: int) -> float:

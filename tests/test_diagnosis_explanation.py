@@ -208,8 +208,8 @@ def test_an_effect_is_observed_in_its_probes_where_the_gap_over_all_was_at_its_f
     text = verdict_text(seen)
     assert "explained" not in text
     assert "Observed there: focal spot larger than assumed, 0.700 mm (0.530 to 0.900)" in text
-    assert "over all probes at its floor of 0.73 already, and 0.70 once that is added." in text
-    assert "the gap was at its floor of 0.73 already: 0.71, and 0.70 with what was found" in lead_text(seen)
+    assert "0.71 (noise alone: 0.73), over all probes no more than noise, and 0.70 once that is added." in text
+    assert "the gap was no more than noise (0.73) already: 0.71, and 0.70 with what was found" in lead_text(seen)
     assert next_steps(seen)[0]["text"].startswith("Use the improved twin")
     # what was no gap and is one with the effect added does not fall
     worse = diagnosis("explained", causes=(found,), named=("focal_spot",), gap=replace(floor, after=1.4), added=("x",))

@@ -152,7 +152,7 @@ class Diagnosis(Result):
             ax.plot([floor] * 2, [place - 0.4, place + 0.4], color="#d9822b", lw=2, label="floor" if first else None)
         ax.set_yticks(range(len(rows)), [name for name, _, _, _ in rows])
         ax.invert_yaxis()
-        ax.set_xlabel("gap on held-out probes (1 = nothing but noise)")
+        ax.set_xlabel("gap on held-out probes (rms, in standard deviations)")
         ax.legend(frameon=False)
         return ax
 

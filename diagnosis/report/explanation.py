@@ -133,11 +133,11 @@ def lead_text(diagnosis: Diagnosis) -> str:
         told.append(_UNTESTED)
     elif gap.at_floor:
         told.append(
-            f"Over all probes of series that the fit did not use, the gap was at its floor of {gap.floor:.2f} already:"
+            f"Over all probes of series that the fit did not use, the gap was no more than noise ({gap.floor:.2f}) already:"
             f" {gap.before:.2f}, and {gap.after:.2f} with what was found added to the twin."
         )
     else:
-        ends = f"the gap on series that the fit did not use, {gap.before:.2f} (1: noise alone), {_falls(gap)}"
+        ends = f"the gap on series that the fit did not use, {gap.before:.2f} (noise alone: {gap.floor:.2f}), {_falls(gap)}"
         told.append(f"With what was found added to the twin, {ends}.")
     return " ".join([*told, *([] if not gap.tested else _no_better(gap)), *_left(diagnosis)])
 
@@ -210,7 +210,7 @@ def _relation(gap: Gap) -> str:
 
 
 def _figures(gap: Gap) -> str:
-    return f"On data the fit did not see the gap is {gap.before:.2f} (1 is noise)"
+    return f"On data the fit did not see the gap is {gap.before:.2f} (noise alone: {gap.floor:.2f})"
 
 
 def _not_explained(diagnosis: Diagnosis) -> list[str]:
@@ -286,7 +286,7 @@ def rivals(diagnosis: Diagnosis) -> list[tuple[str, float]]:
 def _falls(gap: Gap) -> str:
     """What becomes of the gap once what was found is added: a verb and the figure."""
     if gap.at_floor:
-        return f"over all probes at its floor of {gap.floor:.2f} already, and {gap.after:.2f}"
+        return f"over all probes no more than noise, and {gap.after:.2f}"
     return f"falls to {gap.after:.2f}" if gap.falls else f"does not fall ({gap.after:.2f})"
 
 

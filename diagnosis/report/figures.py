@@ -194,9 +194,9 @@ def gap_chart(parts: Sequence[tuple[str, float, float, float]], *, added: bool) 
     return Chart(
         name="held_out_gap",
         title="Gap on series that the fit did not use",
-        alt="Root mean square of measured less expected, in units of what noise and calibration allow (1: nothing but noise).",
+        alt="Root mean square of measured less expected, in units of what noise and calibration allow; the floor is noise alone.",
         marks=marks,
-        x_label="gap (1: noise alone)",
+        x_label="gap (rms, in standard deviations)",
         x_scale="log" if long else "linear",
         x_ends=(smallest, 2.6 * largest) if long else (0.0, 1.15 * largest),
         y_ticks=dict(zip(map(float, y), names, strict=True)),

@@ -204,11 +204,11 @@ def _key_figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
         found.append(
             {
                 "value": f"{gap.before:.2f} → {gap.after:.2f}",
-                "text": "gap on series that the fit did not use (1: noise alone)",
+                "text": f"gap on series that the fit did not use (noise alone: {gap.floor:.2f})",
             }
         )
     else:
-        found.append({"value": f"{gap.before:.2f}", "text": "gap (1: noise alone)"})
+        found.append({"value": f"{gap.before:.2f}", "text": f"gap (noise alone: {gap.floor:.2f})"})
     if removes and gap.shrinks_by is not None:
         value, low, high = (100.0 * min(one, 1.0) for one in gap.shrinks_by)
         text = f"of the gap above noise is removed (95 %: {low:.0f} to {high:.0f} %)"

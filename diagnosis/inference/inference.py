@@ -195,10 +195,10 @@ def _left_by_given(
     others = [effect for effect in singles if not observed.has(effect)]
     if not (observed.given and others):
         return None
-    acting = observed.acting(observed.given)
     levels = [(1.0, at_most_off(observed.given[0].level))]
     return max(
-        weighed[effect].log_evidence + log_odds_of_leak_in(observed, singles[effect].best, acting, levels)
+        weighed[effect].log_evidence
+        + log_odds_of_leak_in(observed, singles[effect].best, observed.acting(observed.given, effect), levels)
         for effect in others
     )
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
+from ...generator.effects import EFFECTS
 from ..model.curves import Curve
 from .discrepancy import LEAST_FACTOR, credible, law_factors, own_variance
 from .nuisances import Nuisances
@@ -178,8 +179,10 @@ class Observed:
             squares += strength**2 * float(np.sum(curve.jitter))
         return math.sqrt(max(squares, 0.0))
 
-    def acting(self, points: Sequence[Point]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    def acting(self, points: Sequence[Point], other: str) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Part of the session (probe,) in which laws leave no more than a share of what they do there, and that: squares (part,).
+
+        other: the effect in whose shape they would leave it; those that cannot do nothing here.
 
         Of effects that are the same in every frame, or new in each, mean and noise of frames are parts of their own. What is new in
         every frame does nothing to their mean but by chance, which the covariance holds.
@@ -195,8 +198,9 @@ class Observed:
                 parts,
             )
             for point in points
+            if EFFECTS[point.effect].may_leave(EFFECTS[other])
         ]
-        return parts, np.sum(squares, axis=0)
+        return parts, np.sum([np.zeros(int(parts.max()) + 1), *squares], axis=0)
 
     def power_by_part(self, curve: Curve, strength: float, parts: NDArray[np.intp]) -> NDArray[np.float64]:
         """The square of `length` in each of some parts (part,), were the curve (in these units) to move that part and no other.

@@ -210,7 +210,7 @@ def log_odds_of_leak(observed: Observed, pair: Pair) -> tuple[str, float]:
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
     shares = np.exp(shares - np.logaddexp.reduce(shares))
     levels = map(at_most_off, LEVELS.levels)
-    acting = observed.acting([first.point])
+    acting = observed.acting([first.point], weak)
     return strong, log_odds_of_leak_in(observed, second, acting, list(zip(shares, levels, strict=False)), shape=left)
 
 

@@ -379,9 +379,7 @@ def changed_tiles(probes: SeriesProbes, signal: NDArray[np.float64], tiles: Tile
     number = rows[:, None] * (columns[-1] + 1) + columns
     found = np.zeros((len(probes), int(number[-1, -1]) + 1))
     if item.request.beam_on and not item.calibrates:
-        # what all tiles share is the level
-        shares = np.bincount(number.ravel()) / number.size
-        images = ((np.where(number == tile, 1.0, 0.0) - share) * 0.01 * signal for tile, share in enumerate(shares))
+        images = (np.where(number == tile, 0.01, 0.0) * signal for tile in range(found.shape[1]))
         found[:maps] = probes.projection.apply(np.stack(list(images)).astype(np.float32)).T
     return found
 
@@ -396,11 +394,12 @@ def noise_of_lines(probes: SeriesProbes) -> NDArray[np.float64]:
 @lru_cache(maxsize=1)
 def _pattern_waves(shape: tuple[int, ...]) -> NDArray[np.float32]:
     """The smooth part of 1 % of a changed gain map: waves (wave, row, column) that it holds by chance."""
-    waves = _waves(shape, scales.PATTERN_WAVES + 1)
-    total = sum(1.0 / math.hypot(*numbers) for numbers in waves)
+    # pixels that change their gain change that of the panel: the even field as much as the longest wave
+    waves = {(0, 0): np.ones(shape), **_waves(shape, scales.PATTERN_WAVES + 1)}
+    weights = [1.0 / max(math.hypot(*numbers), 1.0) for numbers in waves]
     result = np.empty((len(waves), *shape), np.float32)
-    for image, (numbers, wave) in zip(result, waves.items(), strict=True):
-        share = scales.PATTERN_SMOOTH_SHARE / math.hypot(*numbers) / total
+    for image, weight, wave in zip(result, weights, waves.values(), strict=True):
+        share = scales.PATTERN_SMOOTH_SHARE * weight / sum(weights)
         image[...] = 0.01 * math.sqrt(share / float(np.mean(wave**2))) * wave
     return result
 

@@ -243,6 +243,7 @@ class Effect:
         remembers_all: light of all earlier series acts, not that of the last ones alone.
         course: `steady`: it does the same to every frame of one setting and scene, so that what it changes of their noise follows
             from what it changes of their mean; `random`: something new to every frame, and nothing to their mean; empty: neither.
+        pattern: all that it does, whatever its law, is a factor to the light of each pixel, the same in every frame.
         options: words that an applied effect may carry, with what they mean.
         after_calibration: usual onset: True, it set in after the calibration series; False, it was always there; either_onset: the
             diagnosis tries both. in_some_series: it may act in some series only, such as those on a moving belt.
@@ -272,6 +273,7 @@ class Effect:
     timed: bool = False
     remembers_all: bool = False
     course: str = ""
+    pattern: bool = False
     reading: Reading = Reading()
     grid: Grid = Grid()
     variation: Variation = Variation()
@@ -311,6 +313,13 @@ class Effect:
     def strength(self) -> Parameter:
         """The parameter that reports quote."""
         return self.parameters[0]
+
+    def may_leave(self, other: "Effect") -> bool:
+        """Whether its law, off as it may be, can look like another effect where it acts.
+
+        A pattern whose every form is drawn by chance leaves another pattern at the most.
+        """
+        return not (self.pattern and self.variation.random in ("pixels", "tiles")) or other.pattern
 
     @property
     def usual_onset(self) -> str:

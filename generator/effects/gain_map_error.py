@@ -72,6 +72,7 @@ GAIN_MAP_ERROR = Effect(
     reference="fixed-pattern noise (PRNU), EMVA Standard 1288, release 4.0",
     after_calibration=True,
     course="steady",
+    pattern=True,
     change=_change_gain,
     isolated_by="flats repeated, and behind a filter",
     shows=Shows(series=EVERY_SERIES, axis="position", flats=False),

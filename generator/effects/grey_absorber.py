@@ -150,6 +150,7 @@ GREY_ABSORBER = Effect(
     reference="Beer-Lambert law behind a sheet; a mesh of opaque wires takes the same share at every energy",
     after_calibration=True,
     course="steady",
+    pattern=True,
     change=_cover,
     needs=("spectral",),
     isolated_by="flats with the absorber's side of the beam uncovered, and with the panel turned by 180 degrees",

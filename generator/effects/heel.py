@@ -137,6 +137,7 @@ HEEL = Effect(
     reference="path z cot(alpha + phi) in the anode, to second order in the position: Braun (1978), doi:10.1088/0031-9155/23/5/005",
     after_calibration=True,
     course="steady",
+    pattern=True,
     change=_tilt,
     needs=("spectral",),
     isolated_by="a flat with the panel turned by 180 degrees, and a wedge at two places",

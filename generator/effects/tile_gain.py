@@ -68,6 +68,7 @@ TILE_GAIN = Effect(
     reference="gains of readout chips beside each other: spatial nonuniformity, EMVA Standard 1288, release 4.0",
     after_calibration=True,
     course="steady",
+    pattern=True,
     change=_change_tiles,
     isolated_by="flats repeated, and behind a filter: steps that stay at the seams",
     shows=Shows(series=LIT_SERIES, axis="position", flats=False),

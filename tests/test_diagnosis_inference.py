@@ -33,6 +33,7 @@ from raytwin.diagnosis.judgement.strengths import _outright, applied_at_best
 from raytwin.diagnosis.model.changes import Variant
 from raytwin.diagnosis.model.curves import Curve
 from raytwin.diagnosis.problem.problem import Problem
+from raytwin.diagnosis.problem.scenes_apart import scenes_apart
 from raytwin.generator.effects import EFFECTS, AppliedEffect, Parameter
 
 PROBES = 600
@@ -1158,3 +1159,29 @@ def test_a_problem_with_an_effect_in_some_series_keeps_its_names_and_its_prior()
     assert own.name == "in 2 series"
     np.testing.assert_array_equal(found.curves[-1].responses, [[1, 1, 0, 0, 1, 1]])
     assert (own.series, own.log_prior) == (("first", "third"), -2.0)
+
+
+def displaced(response, **parameters):
+    """A misregistration of 2 px that moves the probes so."""
+    variant = Variant(effect="misregistration", low=0.1, high=3.0, strengths=(2.0,), parameters=parameters)
+    return Curve(variant=variant, responses=np.array([response]))
+
+
+def test_scenes_that_are_put_down_one_by_one_lie_elsewhere_each_by_an_amount_of_its_own():
+    shift = {"magnification_deg": 0.0, "rotation_deg": 0.0}
+    along_rows, along_columns = [4.0, 0.0, 4.0, 0.0, 0.0], [0.0, 4.0, 0.0, 4.0, 0.0]
+    curves = [
+        displaced([9.0] * 5, direction_deg=0.0, magnification_deg=0.0, rotation_deg=90.0),
+        displaced(along_rows, direction_deg=0.0, **shift),
+        displaced(along_columns, direction_deg=90.0, **shift),
+    ]
+    names, series_of = ("edge", "wedge", "flat"), np.array([0, 0, 1, 1, 2])
+    found = scenes_apart(curves, [("edge", 1.0), ("wedge", 1.0), None], names, series_of)
+    assert found.by_chance_alone
+    assert found.variant.apart
+    assert found.variant.series == ("edge", "wedge")
+    # of each pixel of rms, as much along rows as along columns
+    np.testing.assert_allclose(found.spread.T, math.sqrt(2.0) * np.eye(4, 5))
+    # series of one placement lie elsewhere together
+    together = scenes_apart(curves, [("edge", 1.0), ("edge", 1.0), None], names, series_of)
+    assert together is None

@@ -11,6 +11,7 @@ from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.line.twin import Twin
 from ...results import Result, Table, axes_or_new, frame, plain
 from ..inference.inference import Hypothesis
+from ..model.changes import EACH_SCENE
 from ..problem.problem import Problem
 from ..session.binning import lost_by_binning, parameters_in_pixels
 from .held_out import Gap
@@ -30,7 +31,7 @@ class Cause:
     """An effect, how probable it is, its strength and inner parameters, how far the gap shrinks with it, and what its law leaves.
 
     strength: value, low, high, signed; level: by how much of itself its law seems to be off; series: names of those in which it
-    acts, empty: all since its onset.
+    acts, empty: all since its onset; apart: in each scene of these by an amount of its own.
     """
 
     effect: str
@@ -43,6 +44,7 @@ class Cause:
     level: float = 0.0
     left: tuple["Place", ...] = ()
     series: tuple[str, ...] = ()
+    apart: bool = False
 
     @property
     def onset(self) -> str | tuple[str, ...]:
@@ -172,7 +174,7 @@ class Diagnosis(Result):
                 cause.effect,
                 f"{cause.probability:.2f}",
                 f"{cause.strength[0]:.3g} ({cause.strength[1]:.3g} to {cause.strength[2]:.3g}) {cause.unit}".rstrip(),
-                f"in {len(cause.series)} series" if cause.series else cause.since,
+                EACH_SCENE if cause.apart else f"in {len(cause.series)} series" if cause.series else cause.since,
             )
             for cause in self.causes
         ]

@@ -20,7 +20,7 @@ from ..inference.nuisances import LocalNuisances, Nuisances, Whitening
 from ..inference.observed import Observed
 from ..inference.refine import SEEN_FROM, refine
 from ..inference.steady import Steady
-from ..model.changes import Variant
+from ..model.changes import EACH_SCENE, Variant
 from ..model.curves import Curve
 from ..problem.problem import Problem
 from .answer import NO_GAP_FROM, Cause, Diagnosis, Place, improved
@@ -109,6 +109,9 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
             problem = problem.in_series(part.variant, part.series, part.log_prior)
             more = whitening.curves(problem.curves[len(whitened) :])
             whitened, fits = (*whitened, *more), [*fits, *fit_effects(observed, more)]
+    problem = problem.with_scenes_apart()
+    more = whitening.curves(problem.curves[len(whitened) :])
+    whitened, fits = (*whitened, *more), [*fits, *fit_effects(observed, more)]
 
     def weigh(seen: Sequence[tuple[Observed, Sequence[CurveFit]]], *, misfits: bool) -> tuple[Hypothesis, ...]:
         return weigh_hypotheses(
@@ -307,6 +310,7 @@ def _causes(
                 parameters=dict(variant.parameters),
                 since=variant.since,
                 series=variant.series,
+                apart=variant.apart,
                 shrinks_by=shares.get(effect),
                 level=best.levels.get(effect, 0.0),
                 left=left if effect in named else (),
@@ -383,9 +387,11 @@ def _of_another_strength(problem: Problem, verdict: Verdict) -> tuple[str, ...]:
 
 
 def _in_some(leading: Hypothesis) -> tuple[str, ...]:
-    """What to say of effects that act in some series only."""
+    """What to say of effects that act in some series only, or in each scene by itself."""
     return tuple(
-        f"{title_of(effect)} acts in {', '.join(curve.variant.series)} only: the improved twin is left without it"
+        f"{title_of(effect)}, {EACH_SCENE}: the improved twin is left without it"
+        if curve.variant.apart
+        else f"{title_of(effect)} acts in {', '.join(curve.variant.series)} only: the improved twin is left without it"
         for effect, curve in leading.variants.items()
         if curve.variant.series
     )

@@ -82,6 +82,7 @@ CUT_OFF_SHARE = 0.5  # of a step by which lost bits may lower a level
 PATTERN_WAVES = 8  # cosine waves along each side of a gain map's smooth change, the long ones the larger
 PATTERN_SMOOTH_SHARE = 0.5  # of that change's variance
 DARK_SD_DN = 0.25  # of the dark between series: half of the limit
+EACH_SCENE = "each scene by itself"  # where an effect acts that displaces each by an amount of its own
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,8 +93,8 @@ class Variant:
     the strength; strengths > 0, ascending, at which the response is computed; fitted: its inner parameters with their ranges here;
     refined_from: name of the variant that was refined to be this one, None: not refined; series: names of those in which it acts
     (empty: all); log_prior: log probability of that, against one that acts in all; most: strength beyond which there is nothing (a
-    share of 100 %); beside: another effect that is there: its response is what it adds to that one's; course: what the effect is
-    from frame to frame, as `Effect` says (empty: not known).
+    share of 100 %); apart: it displaces each scene by an amount of its own, by chance; beside: another effect that is there: its
+    response is what it adds to that one's; course: what the effect is from frame to frame, as `Effect` says (empty: not known).
     """
 
     effect: str
@@ -109,6 +110,7 @@ class Variant:
     series: tuple[str, ...] = ()
     log_prior: float = 0.0
     most: float = math.inf
+    apart: bool = False
     beside: AppliedEffect | None = None
     course: str = ""
 

@@ -8,6 +8,7 @@ Files:
     series_block       one series in numbers: residual, nuisances, responses, random parts
     nuisance_columns   nuisances of one series
     other_scenes       scenes as they may be instead
+    scenes_apart       scenes that each lie elsewhere by an amount of its own
     surroundings       light that effects bring in from beyond the borders
     line_noise         noise of rows and columns that is no effect
     output_course      levels and trends of a drifting output

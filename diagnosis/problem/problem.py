@@ -22,6 +22,7 @@ from ..session.even_maps import Map, full_size
 from ..session.session import SessionSeries
 from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
 from .asked_again import AskedAgain
+from .scenes_apart import scenes_apart
 
 _OF_FRAMES = ("noise", "texture", "time")  # axes of what frames of a series differ by
 _WITHOUT_SCENE = 0.07  # time that a series without a scene takes, over that of one with a scene
@@ -93,6 +94,16 @@ class Problem:
             responses=np.where(np.isin(self.series_of, series), curve.responses, 0.0),
         )
         return replace(self, curves=(*self.curves, own))
+
+    def with_scenes_apart(self) -> "Problem":
+        """With one more variant of an effect that displaces scenes, where there are several: each has an amount of its own."""
+        own = scenes_apart(
+            self.curves,
+            [view.session.place if view.session.series.kind == "object" else None for view in self.views],
+            [view.session.name for view in self.views],
+            self.series_of,
+        )
+        return self if own is None else replace(self, curves=(*self.curves, own))
 
     def residual_without(self, effects: Sequence[str]) -> NDArray[np.float64]:
         """The residual (probe,) of the base less those of its own effects that are among these."""

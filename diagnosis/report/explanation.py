@@ -187,7 +187,7 @@ def _causes(diagnosis: Diagnosis) -> Table:
             title_of(cause.effect),
             f"{cause.probability:.2f}",
             strength_text(cause),
-            f"in {len(cause.series)} series" if cause.series else when_text(cause),
+            f"in {len(cause.series)} series" if cause.series and not cause.apart else when_text(cause),
             (diagnosis.gap.tested and share_text(cause.shrinks_by)) or "-",
         )
         for cause in diagnosis.leading

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from ...generator.effects import EFFECTS
 from ..inference.inference import title_of
 from ..judgement.answer import Cause, Place
+from ..model.changes import EACH_SCENE
 
 _SHAPED_LIKE = "like "  # templates of what effects would do
 _KIND_WORDS = {"flat": "flats", "dark": "darks", "object": "objects", "afterglow": "frames after the beam"}
@@ -126,6 +127,8 @@ def meaning_text(effect: str) -> str:
 
 def when_text(cause: Cause) -> str:
     """Since when, or in which series, a cause acts."""
+    if cause.apart:
+        return EACH_SCENE
     if cause.series:
         return f"in {', '.join(cause.series)} only"
     return "always there" if cause.since == "always" else "since the calibration"

@@ -1,0 +1,65 @@
+"""Scenes that are put down one after the other: each lies elsewhere than its maps, by an amount of its own."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.effects import EFFECTS
+from ...generator.effects.effect import Displacement
+from ..model.changes import EACH_SCENE
+from ..model.curves import LEAST_RESPONSE, Curve
+
+# along rows and along columns; what a scene is turned besides is left to the law's discrepancy
+_WAYS: tuple[Callable[[Displacement], bool], ...] = (
+    lambda lies: _all_of(lies.shift_px, lies) and lies.direction_deg == 0.0,
+    lambda lies: _all_of(lies.shift_px, lies) and lies.direction_deg == 90.0,
+)
+
+
+def scenes_apart(
+    curves: Sequence[Curve], places: Sequence[object | None], names: Sequence[str], series_of: NDArray[np.intp]
+) -> Curve | None:
+    """What a displacement of each scene by itself does by chance, its rms over all scenes the strength.
+
+    Args:
+        curves: of the grid, those of one effect that displaces scenes among them.
+        places: where each series' scene stood; None: it has none.
+        names: of the series.
+        series_of: number of each probe's series (probe,).
+
+    Returns:
+        A curve without a mean response; None: there are not two scenes that such an effect moves.
+    """
+    ways = [next((curve for curve in curves if _moves(curve, way)), None) for way in _WAYS]
+    found = [curve for curve in ways if curve is not None]
+    columns, seen = [], set[object]()
+    for place in dict.fromkeys(place for place in places if place is not None):
+        here = np.array([one == place for one in places])[series_of]
+        for curve in found:
+            column = np.where(here, curve.responses[-1] / curve.strengths[-1] / math.sqrt(len(_WAYS)), 0.0)
+            if float(np.max(np.abs(column))) > LEAST_RESPONSE:
+                columns.append(column)
+                seen.add(place)
+    if len(seen) < 2:
+        return None
+    variant = replace(
+        found[0].variant,
+        name=EACH_SCENE,
+        parameters={},
+        fitted=(),
+        series=tuple(name for name, place in zip(names, places, strict=True) if place in seen),
+        apart=True,
+    )
+    return Curve(variant=variant, responses=np.zeros_like(found[0].responses), spread=np.stack(columns, axis=1))
+
+
+def _moves(curve: Curve, way: Callable[[Displacement], bool]) -> bool:
+    placement = EFFECTS[curve.effect].placement
+    return placement is not None and way(placement.parts({**curve.variant.parameters, "strength": 1.0}))
+
+
+def _all_of(part_px: float, lies: Displacement) -> bool:
+    return math.isclose(part_px, lies.size_px)

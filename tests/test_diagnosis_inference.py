@@ -1073,9 +1073,20 @@ def test_a_law_leaves_no_rest_in_what_one_effect_alone_can_make(setup):
     families = Families(of=GROUPS, names=NAMES, exact=frozenset({7}))
     observed = seen(much, factors)
     assert fit_extra_variance(observed, families).place == "group 7"
-    left = fit_extra_variance(observed, families, left_by_laws=True)
+    left = fit_extra_variance(observed, families, left_by=("tile_gain",))
     assert left.place != "group 7"
     assert left.log_evidence < fit_extra_variance(observed, families).log_evidence - 5.0
+
+
+def test_a_law_leaves_no_rest_in_series_that_its_kind_cannot_move(setup):
+    rng, factors, _ = setup
+    much = noise(rng, factors)
+    much[GROUPS == 7] += 2.5 * rng.standard_normal(20)
+    kinds = tuple("dark" if name == "group 7" else "flat" for name in NAMES)
+    families, observed = Families(of=GROUPS, names=NAMES, kinds=kinds), seen(much, factors)
+    assert fit_extra_variance(observed, families, left_by=("tile_gain", "image_lag")).place == "group 7"
+    assert fit_extra_variance(observed, families, left_by=("tile_gain",)).place != "group 7"
+    assert fit_extra_variance(observed, families, left_by=("focal_spot",)).log_evidence == -math.inf
 
 
 def test_the_weaker_of_two_effects_is_weighed_as_it_acts_beside_the_stronger_one_and_beside_no_other():

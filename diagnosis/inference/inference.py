@@ -231,7 +231,8 @@ class Misfits:
         plain = Hypothesis(effects=(), probability=0.0, log_evidence=0.0)
         if not (misfits and self._observed.given):
             return plain
-        found = fit_extra_variance(self._observed.conditioned(), self._families, left_by_laws=True)
+        given = [point.effect for point in self._observed.given]
+        found = fit_extra_variance(self._observed.conditioned(), self._families, left_by=given)
         return self._weighed(plain, [], found.log_evidence, found)
 
     def of_kind(self, hypothesis: Hypothesis, fits: Sequence[CurveFit]) -> tuple[Hypothesis, float]:
@@ -289,7 +290,8 @@ class Misfits:
         alone = beside = self._observed.conditioned(*effects)
         for point in points:
             beside = beside.in_presence_of(point)
-        found = fit_extra_variance(beside, self._families, left_by_laws=True)
+        acting = {*effects, *(point.effect for point in self._observed.given)}
+        found = fit_extra_variance(beside, self._families, left_by=acting)
         evidence = self._observed.log_evidence_without(*effects) + beside.log_likelihood - alone.log_likelihood
         return evidence + found.log_evidence, found
 

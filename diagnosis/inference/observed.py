@@ -198,7 +198,7 @@ class Observed:
                 parts,
             )
             for point in points
-            if EFFECTS[point.effect].may_leave(EFFECTS[other])
+            if _may_leave(point.effect, other)
         ]
         return parts, np.sum([np.zeros(int(parts.max()) + 1), *squares], axis=0)
 
@@ -221,6 +221,12 @@ class Observed:
     def _moved(curve: Curve, strength: float) -> NDArray[np.float64]:
         """Rows (1 + chance, probe): what a curve's law does at a strength, and what it does by chance."""
         return np.concatenate([curve.response(strength)[None, :], strength * curve.chance.T])
+
+
+def _may_leave(effect: str, other: str) -> bool:
+    """Whether an effect's law can leave another's shape, as far as the catalogue knows both."""
+    known, left = EFFECTS.get(effect), EFFECTS.get(other)
+    return known is None or left is None or known.may_leave(left)
 
 
 def slope(curve: Curve, strength: float) -> NDArray[np.float64]:

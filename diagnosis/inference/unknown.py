@@ -4,11 +4,14 @@ In how many families an unknown effect shows is not known: every number of them 
 """
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...generator.effects import EFFECTS
+from ...generator.line.series_request import KINDS
 from .observed import Observed
 
 SIZES = np.geomspace(0.5, 5000.0, 14)  # standard deviations
@@ -20,12 +23,22 @@ _SWEEPS = 4
 class Families:
     """Families of probes: one axis of the series of one kind and scene, or what shows in it that one effect alone can make.
 
-    Fields: of (probe,): number of each probe's family; names; exact: numbers of those in which one effect alone shows.
+    Fields: of (probe,): number of each probe's family; names; exact: numbers of those in which one effect alone shows; kinds: of
+    each family's series, empty where they are of several kinds.
     """
 
     of: NDArray[np.intp]
     names: tuple[str, ...]
     exact: frozenset[int] = frozenset()
+    kinds: tuple[str, ...] = ()
+
+    def reached_by(self, effects: Collection[str]) -> frozenset[int]:
+        """Numbers of those in which laws of effects can leave anything: these can move such series, and no other alone does."""
+        moved = {kind for effect in effects for kind in (EFFECTS[effect].shows.series if effect in EFFECTS else KINDS)}
+        kinds = self.kinds or ("",) * len(self.names)
+        return frozenset(
+            number for number, kind in enumerate(kinds) if number not in self.exact and (not kind or kind in moved)
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,8 +54,10 @@ class ExtraVariance:
     length: float
 
 
-def fit_extra_variance(observed: Observed, families: Families, *, left_by_laws: bool = False) -> ExtraVariance:
-    """What a residual shows beyond what may vary, in families of probes; left_by_laws: in none in which one effect alone shows.
+def fit_extra_variance(
+    observed: Observed, families: Families, *, left_by: Collection[str] | None = None
+) -> ExtraVariance:
+    """What a residual shows beyond what may vary, in families of probes; left_by: in those that laws of these effects reach.
 
     Every family may have an extra variance tau^2, log-uniform over a grid; the evidence is that of the best combination (each
     family's tau in turn, several sweeps), its prior in it, of one family at least.
@@ -50,9 +65,10 @@ def fit_extra_variance(observed: Observed, families: Families, *, left_by_laws: 
     residual, nuisances = observed.residual, observed.nuisances
     factors = nuisances.full()
     members = [np.nonzero(families.of == number)[0] for number in range(len(families.names))]
-    open_ones = [
-        number for number, part in enumerate(members) if len(part) and not (left_by_laws and number in families.exact)
-    ]
+    reached = frozenset(range(len(members))) if left_by is None else families.reached_by(left_by)
+    open_ones = [number for number, part in enumerate(members) if len(part) and number in reached]
+    if not open_ones:
+        return ExtraVariance(log_evidence=-math.inf, place="", length=0.0)
     grams = np.stack([factors[part].T @ factors[part] for part in members])
     sums = np.stack([factors[part].T @ residual[part] for part in members])
     squares = np.array([float(np.sum(residual[part] ** 2)) for part in members])

@@ -439,7 +439,15 @@ def _families(names: Sequence[ProbeName], series: Sequence[Series]) -> Families:
         return _PLACES if displaced else f"{name.axis} of {one.kind} {one.scene}".strip()
 
     of, found = _numbered([family(name, one) for name, one in zip(names, series, strict=True)])
-    return Families(of=of, names=found, exact=frozenset(number for number, name in enumerate(found) if name in exact))
+    own: list[set[str]] = [set() for _ in found]
+    for number, one in zip(of, series, strict=True):
+        own[number].add(one.kind)
+    return Families(
+        of=of,
+        names=found,
+        exact=frozenset(number for number, name in enumerate(found) if name in exact),
+        kinds=tuple(next(iter(kinds)) if len(kinds) == 1 else "" for kinds in own),
+    )
 
 
 def _numbered(keys: Sequence[_Key]) -> tuple[NDArray[np.intp], tuple[_Key, ...]]:

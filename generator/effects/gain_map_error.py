@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from ...errors import InputError
 from ..line.line_state import FixedPattern, LineContext, LineState
-from .effect import EVERY_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation, seed_of
+from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation, seed_of
 
 
 def _change_gain(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -75,7 +75,7 @@ GAIN_MAP_ERROR = Effect(
     pattern=True,
     change=_change_gain,
     isolated_by="flats repeated, and behind a filter",
-    shows=Shows(series=EVERY_SERIES, axis="position", flats=False),
+    shows=Shows(series=LIT_SERIES, axis="position", flats=False),
     absorbed="maps",
     # a smooth effect beside it may take a tenth of the variance for its own
     reading=Reading(probes=("fixed_pattern",), sd=0.05, map_rms=True),

@@ -1078,15 +1078,26 @@ def test_a_law_leaves_no_rest_in_what_one_effect_alone_can_make(setup):
     assert left.log_evidence < fit_extra_variance(observed, families).log_evidence - 5.0
 
 
-def test_a_law_leaves_no_rest_in_series_that_its_kind_cannot_move(setup):
+@pytest.mark.parametrize(
+    ("place", "reached_by"),
+    [
+        (("dark", "position"), {"image_lag"}),
+        (("flat", "noise"), {"image_lag", "kv_error"}),
+        (("flat", "position"), {"image_lag", "kv_error", "tile_gain"}),
+        (("object", "sharpness"), {"image_lag", "kv_error", "tile_gain", "focal_spot"}),
+    ],
+)
+def test_a_law_leaves_no_rest_where_its_kind_does_nothing(setup, place, reached_by):
     rng, factors, _ = setup
     much = noise(rng, factors)
     much[GROUPS == 7] += 2.5 * rng.standard_normal(20)
-    kinds = tuple("dark" if name == "group 7" else "flat" for name in NAMES)
-    families, observed = Families(of=GROUPS, names=NAMES, kinds=kinds), seen(much, factors)
-    assert fit_extra_variance(observed, families, left_by=("tile_gain", "image_lag")).place == "group 7"
-    assert fit_extra_variance(observed, families, left_by=("tile_gain",)).place != "group 7"
-    assert fit_extra_variance(observed, families, left_by=("focal_spot",)).log_evidence == -math.inf
+    of_kind = tuple(place if name == "group 7" else ("afterglow", "time") for name in NAMES)
+    families, observed = Families(of=GROUPS, names=NAMES, of_kind=of_kind), seen(much, factors)
+    for effect in ("image_lag", "kv_error", "tile_gain", "focal_spot"):
+        found = fit_extra_variance(observed, families, left_by=(effect,))
+        assert (found.place == "group 7") == (effect in reached_by)
+        if effect not in ("image_lag", *reached_by):
+            assert found.log_evidence == -math.inf
 
 
 def test_the_weaker_of_two_effects_is_weighed_as_it_acts_beside_the_stronger_one_and_beside_no_other():

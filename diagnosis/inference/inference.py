@@ -24,7 +24,7 @@ from ..model.curves import Curve
 from .curve_fits import IN_FULL, CurveFit, interval_of, log_mean_exp
 from .discrepancy import LEVELS, at_most_off, log_frequency, log_misfit
 from .observed import Observed, Point
-from .pairs import Single, log_odds_of_leak, log_odds_of_leak_in, log_prior, weigh_pairs
+from .pairs import Single, log_odds_of_leak, log_odds_of_leak_in, log_prior, may_leave, weigh_pairs
 from .unknown import LOG_DENSITY, ExtraVariance, Families, fit_extra_variance
 
 UNKNOWN = "unknown_effect"
@@ -192,13 +192,14 @@ def _left_by_given(
 
     weighed: each effect alone, with a misfit or without.
     """
-    others = [effect for effect in singles if not observed.has(effect)]
-    if not (observed.given and others):
+    given = [point.effect for point in observed.given]
+    others = [one for one in singles if one not in given and any(may_leave(effect, one) for effect in given)]
+    if not others:
         return None
+    acting = observed.acting(observed.given)
     levels = [(1.0, at_most_off(observed.given[0].level))]
     return max(
-        weighed[effect].log_evidence
-        + log_odds_of_leak_in(observed, singles[effect].best, observed.acting(observed.given, effect), levels)
+        weighed[effect].log_evidence + log_odds_of_leak_in(observed, singles[effect].best, acting, levels)
         for effect in others
     )
 

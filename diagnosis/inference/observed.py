@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
-from ...generator.effects import EFFECTS
 from ..model.curves import Curve
 from .discrepancy import LEAST_FACTOR, credible, law_factors, own_variance
 from .nuisances import Nuisances
@@ -179,10 +178,9 @@ class Observed:
             squares += strength**2 * float(np.sum(curve.jitter))
         return math.sqrt(max(squares, 0.0))
 
-    def acting(self, points: Sequence[Point], other: str) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    def acting(self, points: Sequence[Point]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Part of the session (probe,) in which laws leave no more than a share of what they do there, and that: squares (part,).
 
-        other: the effect in whose shape they would leave it; those that cannot do nothing here.
 
         Of effects that are the same in every frame, or new in each, mean and noise of frames are parts of their own. What is new in
         every frame does nothing to their mean but by chance, which the covariance holds.
@@ -198,9 +196,8 @@ class Observed:
                 parts,
             )
             for point in points
-            if _may_leave(point.effect, other)
         ]
-        return parts, np.sum([np.zeros(int(parts.max()) + 1), *squares], axis=0)
+        return parts, np.sum(squares, axis=0)
 
     def power_by_part(self, curve: Curve, strength: float, parts: NDArray[np.intp]) -> NDArray[np.float64]:
         """The square of `length` in each of some parts (part,), were the curve (in these units) to move that part and no other.
@@ -221,12 +218,6 @@ class Observed:
     def _moved(curve: Curve, strength: float) -> NDArray[np.float64]:
         """Rows (1 + chance, probe): what a curve's law does at a strength, and what it does by chance."""
         return np.concatenate([curve.response(strength)[None, :], strength * curve.chance.T])
-
-
-def _may_leave(effect: str, other: str) -> bool:
-    """Whether an effect's law can leave another's shape, as far as the catalogue knows both."""
-    known, left = EFFECTS.get(effect), EFFECTS.get(other)
-    return known is None or left is None or known.may_leave(left)
 
 
 def slope(curve: Curve, strength: float) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...generator.effects import EFFECTS
 from ..model.curves import Curve
 from .curve_fits import IN_FULL, CurveFit, first_looks, fit_curve, log_integral, log_mean_exp, refined
 from .discrepancy import FARTHEST_LEVEL, LEVELS, at_most_off, leak_below, leak_density, log_frequency, only
@@ -189,15 +190,23 @@ def _beside(beside: Observed, curves: Sequence[Curve]) -> CurveFit:
     return replace(best, log_evidence=total, share=total - best.log_evidence)
 
 
+def may_leave(effect: str, other: str) -> bool:
+    """Whether an effect's law, off as it may be, can leave another's shape, as far as the catalogue knows both."""
+    known, left = EFFECTS.get(effect), EFFECTS.get(other)
+    return known is None or left is None or known.may_leave(left)
+
+
 def log_odds_of_leak(observed: Observed, pair: Pair) -> tuple[str, float]:
     """Which of two moves the probes more, and how much likelier its law's leaving the other's shape is than that effect: log of it.
 
-    The likelihood of the weaker one's strength is integrated over what such a law leaves in place of that effect's prior. Of that
-    shape a steady law leaves what is steady.
+    Minus infinity where its law cannot. The likelihood of the weaker one's strength is integrated over what such a law leaves in
+    place of that effect's prior. Of that shape a steady law leaves what is steady.
     """
     weak, strong = sorted(
         pair.fits, key=lambda effect: observed.length(pair.fits[effect].curve, pair.fits[effect].best)
     )
+    if not may_leave(strong, weak):
+        return strong, -math.inf
     first, second = pair.fits[strong], pair.fits[weak]
     left = second
     courses = first.curve.variant.course, second.curve.variant.course
@@ -210,7 +219,7 @@ def log_odds_of_leak(observed: Observed, pair: Pair) -> tuple[str, float]:
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
     shares = np.exp(shares - np.logaddexp.reduce(shares))
     levels = map(at_most_off, LEVELS.levels)
-    acting = observed.acting([first.point], weak)
+    acting = observed.acting([first.point])
     return strong, log_odds_of_leak_in(observed, second, acting, list(zip(shares, levels, strict=False)), shape=left)
 
 

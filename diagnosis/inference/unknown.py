@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
-from ...generator.line.series_request import KINDS
 from .observed import Observed
 
 SIZES = np.geomspace(0.5, 5000.0, 14)  # standard deviations
@@ -23,21 +22,22 @@ _SWEEPS = 4
 class Families:
     """Families of probes: one axis of the series of one kind and scene, or what shows in it that one effect alone can make.
 
-    Fields: of (probe,): number of each probe's family; names; exact: numbers of those in which one effect alone shows; kinds: of
-    each family's series, empty where they are of several kinds.
+    Fields: of (probe,): number of each probe's family; names; exact: numbers of those in which one effect alone shows; of_kind:
+    kind of each family's series (empty: several) and axis; nothing where that is not known.
     """
 
     of: NDArray[np.intp]
     names: tuple[str, ...]
     exact: frozenset[int] = frozenset()
-    kinds: tuple[str, ...] = ()
+    of_kind: tuple[tuple[str, str], ...] = ()
 
     def reached_by(self, effects: Collection[str]) -> frozenset[int]:
-        """Numbers of those in which laws of effects can leave anything: these can move such series, and no other alone does."""
-        moved = {kind for effect in effects for kind in (EFFECTS[effect].shows.series if effect in EFFECTS else KINDS)}
-        kinds = self.kinds or ("",) * len(self.names)
+        """Numbers of those in which laws of effects can leave anything; an effect that the catalogue does not hold can in all."""
+        known = [EFFECTS.get(effect) for effect in effects]
         return frozenset(
-            number for number, kind in enumerate(kinds) if number not in self.exact and (not kind or kind in moved)
+            number
+            for number, place in enumerate(self.of_kind or (("", ""),) * len(self.names))
+            if number not in self.exact and any(effect is None or effect.reaches(*place) for effect in known)
         )
 
 

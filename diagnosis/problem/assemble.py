@@ -439,14 +439,14 @@ def _families(names: Sequence[ProbeName], series: Sequence[Series]) -> Families:
         return _PLACES if displaced else f"{name.axis} of {one.kind} {one.scene}".strip()
 
     of, found = _numbered([family(name, one) for name, one in zip(names, series, strict=True)])
-    own: list[set[str]] = [set() for _ in found]
-    for number, one in zip(of, series, strict=True):
-        own[number].add(one.kind)
+    places: list[set[tuple[str, str]]] = [set() for _ in found]
+    for number, name, one in zip(of, names, series, strict=True):
+        places[number].add((one.kind, name.axis))
     return Families(
         of=of,
         names=found,
         exact=frozenset(number for number, name in enumerate(found) if name in exact),
-        kinds=tuple(next(iter(kinds)) if len(kinds) == 1 else "" for kinds in own),
+        of_kind=tuple(next(iter(own)) if len(own) == 1 else ("", "") for own in places),
     )
 
 

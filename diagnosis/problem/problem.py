@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ...checks.readings import Explained
 from ...generator.effects import EFFECTS, AppliedEffect
+from ...generator.effects.effect import OF_FRAMES
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.twin import Twin
 from ..inference.observed import Point
@@ -24,7 +25,6 @@ from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
 from .asked_again import AskedAgain
 from .scenes_apart import scenes_apart
 
-_OF_FRAMES = ("noise", "texture", "time")  # axes of what frames of a series differ by
 _WITHOUT_SCENE = 0.07  # time that a series without a scene takes, over that of one with a scene
 
 
@@ -145,7 +145,7 @@ class Problem:
     @property
     def aspects(self) -> NDArray[np.intp]:
         """The same (probe,), with what a series' mean frame shows and each kind of what its frames differ by apart."""
-        return self._numbered([name.axis if name.axis in _OF_FRAMES else "mean frame" for name in self.names])
+        return self._numbered([name.axis if name.axis in OF_FRAMES else "mean frame" for name in self.names])
 
     @property
     def alike(self) -> NDArray[np.intp]:

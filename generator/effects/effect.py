@@ -17,6 +17,7 @@ EVERY_SERIES = KINDS
 LIT_SERIES = ("flat", "object")
 # of a diagnosis' answer
 AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", "tails", "task")
+OF_FRAMES = ("noise", "texture", "time")  # axes of what frames of a series differ by
 
 COURSES = ("", "steady", "random")  # of an effect over the frames of one setting and scene
 ABSORBED = {
@@ -314,12 +315,20 @@ class Effect:
         """The parameter that reports quote."""
         return self.parameters[0]
 
-    def may_leave(self, other: "Effect") -> bool:
-        """Whether its law, off as it may be, can look like another effect where it acts.
+    @property
+    def drawn_in_full(self) -> bool:
+        """Whether it is a pattern whose every form is drawn by chance: its law can be off by no more than another pattern."""
+        return self.pattern and self.variation.random in ("pixels", "tiles")
 
-        A pattern whose every form is drawn by chance leaves another pattern at the most.
-        """
-        return not (self.pattern and self.variation.random in ("pixels", "tiles")) or other.pattern
+    def may_leave(self, other: "Effect") -> bool:
+        """Whether its law, off as it may be, can look like another effect where it acts."""
+        return not self.drawn_in_full or other.pattern
+
+    def reaches(self, kind: str, axis: str) -> bool:
+        """Whether it, or what is wrong with its law, can show in an axis of series of a kind (empty: of several)."""
+        # a factor that is the same in every frame is nothing that frames differ by
+        same = self.drawn_in_full and axis in OF_FRAMES
+        return (not kind or kind in self.shows.series) and not same
 
     @property
     def usual_onset(self) -> str:

@@ -181,7 +181,6 @@ class Observed:
     def acting(self, points: Sequence[Point]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Part of the session (probe,) in which laws leave no more than a share of what they do there, and that: squares (part,).
 
-
         Of effects that are the same in every frame, or new in each, mean and noise of frames are parts of their own. What is new in
         every frame does nothing to their mean but by chance, which the covariance holds.
         """

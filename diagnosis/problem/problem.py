@@ -97,8 +97,9 @@ class Problem:
 
     def with_scenes_apart(self) -> "Problem":
         """With one more variant of an effect that displaces scenes, where there are several: each has an amount of its own."""
+        had = {point.effect for point in self.given}
         own = scenes_apart(
-            self.curves,
+            [curve for curve in self.curves if curve.effect not in had],
             [view.session.place if view.session.series.kind == "object" else None for view in self.views],
             [view.session.name for view in self.views],
             self.series_of,

@@ -22,7 +22,7 @@ PIECE_FRAMES = 64  # at most, that are looked at together: each pixel is scaled 
 CODES_FRAMES = 16  # the first, in which codes are counted
 
 # of steps from frame to frame that change nothing: Gaussian noise of 0.7 steps of the ADC; of wider noise rounding leaves a Gaussian
-# (excess kurtosis below 0.02 in 16 frames and more) whose variance does not depend on where values lie between codes (0.1 %)
+# (0.02 of excess kurtosis more, at the most) whose variance does not depend on where values lie between codes (0.1 %)
 ROUNDED_SHARE = 0.37
 
 

@@ -306,7 +306,7 @@ def summarise_series(
         frame_mean_DN=np.concatenate(frame_means),
         distinct_codes=distinct,
         code_range=span,
-        unchanged_share=unchanged / one,
+        unchanged_share=unchanged / np.float32(one),
     )
 
 

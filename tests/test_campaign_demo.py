@@ -133,7 +133,7 @@ def test_the_chapter_says_what_the_diagnosis_said_and_no_more(verdict, effects, 
     assert [(row["mark"], row["name"], row["x"]) for row in rows if row["name"] == "all"] == [
         ("before", "all", "6.6"),
         ("after", "all", "1"),
-        ("measured against measured", "all", "0.9"),
+        ("noise alone", "all", "0.9"),
     ]
 
 

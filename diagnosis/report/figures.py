@@ -186,7 +186,7 @@ def gap_chart(parts: Sequence[tuple[str, float, float, float]], *, added: bool) 
             x=[row[3] for row in rows],
             y=y,
             colour="#111111",
-            label="measured against measured",
+            label="noise alone",
             shape="diamond",
             names=names,
         )
@@ -194,7 +194,7 @@ def gap_chart(parts: Sequence[tuple[str, float, float, float]], *, added: bool) 
     return Chart(
         name="held_out_gap",
         title="Gap on series that the fit did not use",
-        alt="Root mean square of measured less expected, in units of what noise and calibration allow; the floor is noise alone.",
+        alt="Root mean square of measured less expected, in units of what noise and calibration allow; diamonds: noise alone.",
         marks=marks,
         x_label="gap (rms, in standard deviations)",
         x_scale="log" if long else "linear",

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from ...checks.findings import FindingCode
 from ...generator.effects import EFFECTS
-from ...reports import Figure, SortedTable, write_page
+from ...reports import Figure, Picture, SortedTable, write_page
 from ..inference.inference import title_of
 from ..judgement.answer import Cause, Diagnosis
+from ..judgement.held_out import MOST
 from ..problem.assemble import map_changes
 from ..session.binned_twin import effect_in_squares
 from .explanation import compared_text, headline, lead_text, strained_text, verdict_text
@@ -63,7 +64,8 @@ def write_report(
     """
     after = residuals_after(diagnosis)
     maps = gap_maps(diagnosis, after)
-    first = 2 if diagnosis.added else 1  # of the series with most gap
+    # of the series with most gap; what changes the noise of frames or one line of pixels takes little of such a picture
+    first = (2 if _shows(maps) else 0) if diagnosis.added else 1
     groups: dict[str, list[Figure]] = {
         "map": [*maps],
         "curve": [*transmission_curves(diagnosis, after)],
@@ -110,6 +112,12 @@ def write_report(
         nuisances=len(diagnosis.compared.factor_names),
         inputs=answer["inputs"],
     )
+
+
+def _shows(maps: Sequence[Picture]) -> bool:
+    """Whether the first picture loses most of what it holds to the second, the same with what was found added."""
+    squares = [float(np.nanmean(picture.values**2)) for picture in maps[:2]]
+    return len(squares) == 2 and squares[1] < MOST * squares[0]
 
 
 _LABELS = (

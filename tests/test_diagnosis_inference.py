@@ -1082,7 +1082,8 @@ def test_a_law_leaves_no_rest_in_what_one_effect_alone_can_make(setup):
     ("place", "reached_by"),
     [
         (("dark", "position"), {"image_lag"}),
-        (("flat", "noise"), {"image_lag", "kv_error"}),
+        (("flat", "texture"), {"image_lag", "kv_error"}),
+        (("flat", "noise"), {"image_lag", "kv_error", "tile_gain"}),
         (("flat", "position"), {"image_lag", "kv_error", "tile_gain"}),
         (("object", "sharpness"), {"image_lag", "kv_error", "tile_gain", "focal_spot"}),
     ],

@@ -33,7 +33,7 @@ from ..model.defects import lasting_anywhere, memory_of, new_outliers
 from ..model.forward_model import ForwardModel, draft_cache, own_maps, strength_rows
 from ..model.placing import MeasuredScenes, place_scenes
 from ..model.responses import Asked, SeriesModel, SessionModel, session_model
-from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName
+from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, OUTLIERS_ANYWHERE, ProbeName
 from ..probes.tile_seams import SeenSeams, seams_in
 from ..session.even_maps import Map, mean_over, signal_map
 from ..session.preparation import PreparedSession
@@ -441,7 +441,8 @@ def _families(names: Sequence[ProbeName], series: Sequence[Series]) -> Families:
     of, found = _numbered([family(name, one) for name, one in zip(names, series, strict=True)])
     places: list[set[tuple[str, str]]] = [set() for _ in found]
     for number, name, one in zip(of, names, series, strict=True):
-        places[number].add((one.kind, name.axis))
+        # one series stands for all in which pixels stand out
+        places[number].add(("" if name.statistic == OUTLIERS_ANYWHERE else one.kind, name.axis))
     return Families(
         of=of,
         names=found,

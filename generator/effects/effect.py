@@ -327,7 +327,7 @@ class Effect:
     def reaches(self, kind: str, axis: str) -> bool:
         """Whether it, or what is wrong with its law, can show in an axis of series of a kind (empty: of several)."""
         # a factor that is the same in every frame changes the size of what they differ by, and neither its texture nor its course
-        same = self.drawn_in_full and axis in OF_FRAMES[1:]
+        same = self.drawn_in_full and axis in ("texture", "time")
         return (not kind or kind in self.shows.series) and not same
 
     @property

@@ -91,7 +91,8 @@ def test_dust_on_a_flat_is_left_out_and_makes_no_bad_pixel():
     picture[50, 70] *= 0.9
     series = SimpleNamespace(kind="flat", exposure_ms=100.0, corrected=frozenset())
     item = SimpleNamespace(name="flat", series=series, request=SimpleNamespace(beam_on=True), calibrates=False)
-    look = SimpleNamespace(frames=9, mean_DN=picture, pair_variance_DN2=np.full(SHAPE, 900.0))
+    still = np.zeros(SHAPE)
+    look = SimpleNamespace(frames=9, mean_DN=picture, pair_variance_DN2=np.full(SHAPE, 900.0), unchanged_share=still)
     maps = CalibratedMaps(
         darks=SimpleNamespace(under=lambda item: np.zeros(SHAPE)),
         gain=np.ones(SHAPE),
@@ -103,7 +104,7 @@ def test_dust_on_a_flat_is_left_out_and_makes_no_bad_pixel():
         good=ALL,
     )
     expected = SimpleNamespace(signal_DN=np.full(SHAPE, signal))
-    found = new_outliers([SimpleNamespace(session=item, expected=expected, look=look)], maps)
+    found = new_outliers([SimpleNamespace(session=item, expected=expected, look=look)], maps, counting=False)
     assert [tuple(place) for place in np.argwhere(found.bad)] == [(50, 70)]
     assert found.any[20:23, 40:43].all() and np.count_nonzero(found.any) == 10
 

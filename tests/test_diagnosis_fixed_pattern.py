@@ -210,22 +210,20 @@ def test_pixels_that_stand_out_before_every_object_are_the_panels_own(divided):
         gain_white=0.0,
         good=ALL,
     )
-    assert [tuple(place) for place in np.argwhere(new_outliers(seen, maps).bad)] == [dead, hot]
+    assert [tuple(place) for place in np.argwhere(new_outliers(seen, maps, counting=False).bad)] == [dead, hot]
     # three products are too few to tell a defect from what they have in common
-    assert not new_outliers(seen[:6], maps).any.any()
+    assert not new_outliers(seen[:6], maps, counting=False).any.any()
 
 
-def test_noise_that_a_line_has_in_common_makes_no_pixel_of_it_stand_out():
-    rng = np.random.default_rng(6)
-    frames = 5.0 * rng.standard_normal((12, *SHAPE))
-    frames[:, 44] += 20.0 * rng.standard_normal((12, 1))  # a line that jumps as a whole
-    noisy = (70, 33)
-    frames[:, *noisy] *= 6.0
-    pairs = np.mean(np.diff(frames, axis=0) ** 2, axis=0) / 2.0
+def dark_of(frames, mean_DN):
+    """A later dark as the search for pixels that stand out takes it, and the maps of a dark of 100 DN."""
     dark = SimpleNamespace(kind="dark", exposure_ms=100.0, corrected=frozenset())
     item = SimpleNamespace(name="dark", series=dark, request=SimpleNamespace(beam_on=False), calibrates=False)
     look = SimpleNamespace(
-        frames=12, mean_DN=np.full(SHAPE, 100.0) + rng.standard_normal(SHAPE), pair_variance_DN2=pairs
+        frames=len(frames),
+        mean_DN=mean_DN,
+        pair_variance_DN2=np.mean(np.diff(frames, axis=0) ** 2, axis=0) / 2.0,
+        unchanged_share=np.mean(frames[1:] == frames[:-1], axis=0),
     )
     maps = CalibratedMaps(
         darks=SimpleNamespace(under=lambda item: np.full(SHAPE, 100.0)),
@@ -237,6 +235,27 @@ def test_noise_that_a_line_has_in_common_makes_no_pixel_of_it_stand_out():
         gain_white=0.0,
         good=ALL,
     )
-    seen = SimpleNamespace(session=item, look=look)
+    return SimpleNamespace(session=item, look=look), maps
+
+
+def test_noise_that_a_line_has_in_common_makes_no_pixel_of_it_stand_out():
+    rng = np.random.default_rng(6)
+    frames = 5.0 * rng.standard_normal((12, *SHAPE))
+    frames[:, 44] += 20.0 * rng.standard_normal((12, 1))  # a line that jumps as a whole
+    noisy = (70, 33)
+    frames[:, *noisy] *= 6.0
+    seen, maps = dark_of(frames, 100.0 + rng.standard_normal(SHAPE))
+    pairs = seen.look.pair_variance_DN2
     assert np.median(pairs[44]) > 8.0 * np.median(pairs)
-    assert [tuple(place) for place in np.argwhere(new_outliers([seen], maps).bad)] == [noisy]
+    assert [tuple(place) for place in np.argwhere(new_outliers([seen], maps, counting=False).bad)] == [noisy]
+
+
+def test_a_pixel_that_the_adc_puts_on_the_next_code_is_no_defect():
+    rng = np.random.default_rng(7)
+    level = rng.normal(100.0, 7.0, SHAPE)
+    frames = 80.0 * np.round((level + 3.0 * rng.standard_normal((12, *SHAPE))) / 80.0)
+    assert 5 < np.count_nonzero(np.any(frames != 80.0, axis=0)) < 0.02 * level.size
+    seen, maps = dark_of(frames, frames.mean(axis=0))
+    assert not new_outliers([seen], maps, counting=False).any.any()
+    # numbers of a counter are its quanta
+    assert new_outliers([seen], maps, counting=True).bad.any()

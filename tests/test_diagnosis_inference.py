@@ -972,32 +972,33 @@ def test_a_law_of_known_course_leaves_nothing_in_the_noise_of_frames_beyond_its_
     assert found[0].effects == named
 
 
-def test_of_an_effect_a_steady_law_could_leave_what_is_in_proportion_in_series_of_one_beam_and_scene():
+def test_of_an_effect_a_steady_law_could_leave_what_steady_effects_can_do_together():
+    """Series of one beam and scene have probes of their own: of an output that moves, what moves alike in them is left."""
     rng = np.random.default_rng(4)
     factors = rng.standard_normal((PROBES, 6)) * (GROUPS < 3)[:, None]
     whitening = Whitening(factors, GROUPS // 3)
     beam = np.repeat(np.arange(10), 3)[GROUPS]  # three series each
-    alike = np.where(
-        beam < 9, 20 * beam + np.arange(PROBES) % 20, 1000 + np.arange(PROBES)
-    )  # nothing known of the last
-    light = rng.uniform(1.0, 10.0, 30)[GROUPS]
-    steady = [
-        one_node(str(number), light * rng.standard_normal(180 + 20)[alike % 200], course="steady")
-        for number in range(5)
-    ]
-    other = one_node("other", rng.standard_normal(PROBES))
-    found = Steady([*steady, other], alike, whitening)
-    for curve in whitening.curves(steady[:2]):
-        np.testing.assert_allclose(found.of(curve).responses[:, beam < 9], curve.responses[:, beam < 9], atol=1e-9)
-    (white,) = whitening.curves([replace(other, spread=rng.standard_normal((PROBES, 2)))])
-    left = found.of(white)
-    for vector, before in ((left.responses, white.responses), (left.spread.T, white.spread.T)):
-        share = whitening.undo(vector) / light
-        for number in range(9 * 20):
-            assert np.ptp(share[:, alike == number], axis=1) == pytest.approx(0.0, abs=1e-9)
-        np.testing.assert_allclose(vector[:, beam == 9], before[:, beam == 9], atol=1e-9)
-    again = found.of(left)
-    np.testing.assert_allclose(again.responses, left.responses, atol=1e-9)
+    alike = np.where(beam < 9, beam, -1)  # of the last nothing is known
+    # what each of three steady effects, and the light as a whole, does to a beam's probes
+    steady = [one_node(str(number), 1e4 * rng.standard_normal(PROBES), course="steady") for number in range(4)]
+    level = steady[0].responses[0]
+    series = np.eye(30)[GROUPS]
+    moving = level[:, None] * series * 1e-2
+    together = np.stack([moving[:, 3 * number : 3 * number + 3].sum(axis=1) for number in range(10)], axis=1)
+    against = moving[:, ::3] - moving[:, 1::3]
+    found = Steady([*steady, one_node("other", rng.standard_normal(PROBES))], alike, whitening)
+    known = beam < 9
+    # four directions of some sixty hold a quarter of one by chance
+    for vectors, share, at_most in ((together, 1.0, 0.01), (against, 0.0, 0.4)):
+        (white,) = whitening.curves([replace(one_node("drift", vectors[:, 0]), spread=vectors)])
+        left = found.of(white)
+        for after, before in ((left.responses, vectors[:, :1].T), (left.spread.T, vectors.T)):
+            raw = whitening.undo(after)
+            length = np.linalg.norm(before[:, known], axis=1)
+            off = np.linalg.norm((raw - share * before)[:, known], axis=1)
+            assert np.all(off <= at_most * length)
+            np.testing.assert_allclose(raw[:, ~known], before[:, ~known], atol=1e-9)
+    assert len(Steady([one_node("other", level)], alike, whitening).of(white).spread) == PROBES  # no steady effect
 
 
 def test_each_probe_by_itself_is_projected_as_a_unit_vector_is(setup):

@@ -689,19 +689,19 @@ def test_what_one_effect_alone_can_make_is_a_place_of_its_own(line):
 def test_probes_are_alike_where_the_same_stood_in_the_same_beam(line):
     with open_acquisition(line / "session.h5") as acquisition:
         problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=())
-    numbers, counts = np.unique(problem.alike, return_counts=True)
-    assert (counts > 1).sum() > 20
-    for number in numbers[counts > 1]:
+    numbers = np.unique(problem.alike[problem.alike >= 0])
+    together = 0
+    for number in numbers:
         members = np.flatnonzero(problem.alike == number)
         stated = [problem.views[problem.series_of[one]].session for one in members]
-        assert len({problem.series_of[one] for one in members}) == len(members)
+        together += len({one.name for one in stated}) > 1
         assert {problem.names[one].statistic for one in members} == {"mean frame"}
-        assert len({problem.names[one].location for one in members}) == 1
         assert "dark" not in {one.series.kind for one in stated}
         assert (
             len({(one.series.scene, one.series.kV, one.request.panel_rotation_deg, one.calibrates) for one in stated})
             == 1
         )
+    assert together > 3
 
 
 def test_nuisances_act_on_what_is_there_once_an_effect_is_found(line):

@@ -1,7 +1,7 @@
-"""What a steady law may leave beside itself: in all series of one beam and scene the same, as far as its light goes.
+"""What a steady law may leave beside itself: what effects that do the same to every frame can do together.
 
-An effect that does the same to every frame of a setting changes the mean of all series of one beam and scene in proportion. So does
-what its law is off by. A drift, a memory or a bent response does not.
+In all series of one beam and scene these change the mean in the same proportion, so what their laws are off by does too. A drift, a
+memory or a bent response does not.
 """
 
 from collections.abc import Sequence
@@ -15,18 +15,19 @@ from .nuisances import Whitening
 
 
 class Steady:
-    """The part of a curve that is in proportion in all series of one beam and scene."""
+    """The part of a curve that steady effects together can do to the mean frames of each beam and scene."""
 
     def __init__(self, curves: Sequence[Curve], alike: NDArray[np.intp], whitening: Whitening) -> None:
         """
         Args:
-            curves: of all effects, not whitened: the steady ones among them say what is in proportion.
-            alike (probe,): the same number for one probe of the mean frame in series of one beam and scene.
+            curves: of all effects, not whitened.
+            alike (probe,): the same number for probes of the mean frame in series of one beam and scene; negative for other probes.
             whitening: of the curves that are asked for.
         """
         self._whitening = whitening
         steady = [curve.responses[-1] for curve in curves if curve.variant.course == "steady"]
-        self._groups = [(members, _directions(np.stack(steady), members)) for members in _of_one_size(alike) if steady]
+        groups = [np.flatnonzero(alike == number) for number in np.unique(alike[alike >= 0])]
+        self._parts = [(members, _reached(np.stack(steady)[:, members])) for members in groups if steady]
 
     def of(self, curve: Curve) -> Curve:
         """The curve with responses and chance as a steady law could leave them."""
@@ -34,23 +35,17 @@ class Steady:
         return replace(curve, responses=self._part(curve.responses), spread=spread)
 
     def _part(self, whitened: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Vectors (vector, probe), whitened, with what is not in proportion left out."""
+        """Vectors (vector, probe), whitened, with what steady effects cannot do left out."""
         vectors = self._whitening.undo(whitened)
-        for members, directions in self._groups:
-            along = np.einsum("vcm,cm->vc", vectors[:, members], directions)
-            vectors[:, members] = along[:, :, None] * directions
+        for members, reached in self._parts:
+            vectors[:, members] = vectors[:, members] @ reached
         return self._whitening.apply(vectors)
 
 
-def _of_one_size(alike: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Probes (class, member) that are alike, those of as many members together; a probe that is like no other is left out."""
-    order = np.argsort(alike, kind="stable")
-    _, starts, counts = np.unique(alike[order], return_index=True, return_counts=True)
-    return [order[starts[counts == size][:, None] + np.arange(size)] for size in np.unique(counts[counts > 1])]
+def _reached(responses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The part (probe, probe) of a vector that a sum of responses (curve, probe) follows, each times a number of variance 1.
 
-
-def _directions(steady: NDArray[np.float64], members: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Unit vectors (class, member): how steady responses (curve, probe) move probes that are alike, the strongest above all."""
-    moved = np.swapaxes(steady[:, members], 0, 1)  # (class, curve, member)
-    _, _, right = np.linalg.svd(moved, full_matrices=False)
-    return np.asarray(right[:, 0, :])
+    The mean of that sum where the vector is seen with noise of a standard deviation in each probe.
+    """
+    _, lengths, along = np.linalg.svd(responses, full_matrices=False)
+    return np.asarray((along.T * (lengths**2 / (lengths**2 + 1.0))) @ along)

@@ -12,7 +12,7 @@ from ..probes.fixed_pattern import smooth_part
 from ..probes.lasting import OUTLYING, lasting_pixels
 from ..session.even_maps import NEIGHBOURS_PX, near_steps, signal_map
 from ..session.session import SessionSeries
-from ..session.summaries import BLOCK_PX, LEAST_NOISE_DN2, FirstLook
+from ..session.summaries import BLOCK_PX, LEAST_NOISE_DN2, FirstLook, rounded_away
 from ..session.usable import SeenSeries
 from .calibrated_maps import CalibratedMaps
 from .changes import DUST_LIMIT
@@ -31,18 +31,19 @@ class StandingOut:
     any: NDArray[np.bool_]
 
 
-def new_outliers(seen: Sequence[SeenSeries], maps: CalibratedMaps) -> StandingOut:
+def new_outliers(seen: Sequence[SeenSeries], maps: CalibratedMaps, *, counting: bool) -> StandingOut:
     """Pixels in use that stand out in any dark or flat, or in all objects from some time on.
 
     Args:
         seen: series that can be compared.
         maps: dark and gain map of the calibrating series.
+        counting: the detector counts quanta; of others, numbers that stand still say how far a pixel is from the ADC's next step.
     """
     good, shape = maps.good, maps.good.shape
     outlying, dusty = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     for one in seen:
         kind, look = one.session.series.kind, one.look
-        if kind not in ("dark", "flat"):
+        if kind not in ("dark", "flat") or (not counting and rounded_away(look, good)):
             continue
         residual = maps.corrected(one.session, look.mean_DN)
         if kind == "flat":

@@ -213,7 +213,7 @@ def _measured(
     known_good = twin.maps.bad_pixels == 0
     seen, skipped = _seen_series(session, acquisition, model, good=known_good, side=side, tell=tell)
     maps = calibrated_maps(seen, twin=twin, good=known_good)
-    standing_out = new_outliers(seen, maps)
+    standing_out = new_outliers(seen, maps, counting=bool(model.base.instrument.counting))
     lasting = lasting_anywhere(seen, maps.good)
     outlying = standing_out.bad & ~lasting
     clean = maps.good & ~standing_out.any & ~lasting

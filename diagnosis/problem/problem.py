@@ -150,16 +150,16 @@ class Problem:
 
     @property
     def alike(self) -> NDArray[np.intp]:
-        """Number (probe,) that a probe of the mean frame has in all series of one beam, scene and geometry, calibrating or not."""
+        """Number (probe,) of the beam, scene and geometry, calibrating or not, of a probe of the mean frame; -1 for others."""
         keys = []
-        for number, (view, name) in enumerate(zip(self.series_of, self.names, strict=True)):
+        for view, name in zip(self.series_of, self.names, strict=True):
             own, asked = self.views[view].session, self.views[view].session.request
             beam = own.series.kind, own.series.scene, own.series.kV, own.series.filters
             geometry = asked.source_object_mm, asked.source_detector_mm, asked.panel_rotation_deg
-            alone = name.statistic != "mean frame" or own.series.kind == "dark"
-            keys.append(str(number) if alone else f"{beam} {geometry} {own.calibrates} {name.location}")
+            other = name.statistic != "mean frame" or own.series.kind == "dark"
+            keys.append("" if other else f"{beam} {geometry} {own.calibrates}")
         _, found = np.unique(keys, return_inverse=True)
-        return np.asarray(found, dtype=np.intp)
+        return np.where(np.array(keys) == "", -1, found).astype(np.intp)
 
     def _numbered(self, kinds: Sequence[str]) -> NDArray[np.intp]:
         exact = read_exactly()

@@ -89,6 +89,7 @@ class FirstLook:
     mean_DN: NDArray[np.float64]
     pair_variance_DN2: NDArray[np.float64]
     stack_variance_DN2: NDArray[np.float64]
+    unchanged_share: NDArray[np.float32]
     saturated_share: float
 
 
@@ -142,13 +143,14 @@ class _Variances:
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.frames = self.n_steps = 0
-        self._total, self._sum, self._square, self._steps = (np.zeros(shape) for _ in range(4))
+        self._total, self._sum, self._square, self._steps, self._unchanged = (np.zeros(shape) for _ in range(5))
 
     def add(
-        self, x: NDArray[np.float32], cleaned: NDArray[np.float32], steps: NDArray[np.float32]
+        self, raw: NDArray[Any], x: NDArray[np.float32], cleaned: NDArray[np.float32], steps: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         """Sums of a piece taken in; returns that of the squares of its steps."""
         self.frames += len(x)
+        self._unchanged += np.count_nonzero(raw[1:] == raw[:-1], axis=0)
         self.n_steps += len(steps)
         self._total += x.sum(axis=0, dtype=np.float64)
         self._sum += cleaned.sum(axis=0, dtype=np.float64)
@@ -160,6 +162,10 @@ class _Variances:
     @property
     def mean(self) -> NDArray[np.float64]:
         return np.asarray(self._total / self.frames)
+
+    @property
+    def unchanged_share(self) -> NDArray[np.float32]:
+        return (self._unchanged / max(self.n_steps, 1)).astype(np.float32)
 
     @property
     def of_pairs(self) -> NDArray[np.float64]:
@@ -190,7 +196,7 @@ def look_at_series(
             yield piece
 
     for raw, x, cleaned, steps in _pieces(scanned(), good, pattern, name):
-        found.add(x, cleaned, steps)
+        found.add(raw, x, cleaned, steps)
         if saturation_DN is not None and float(raw.max()) >= saturation_DN:
             saturated += int(np.count_nonzero(raw[:, good] >= saturation_DN))
     return FirstLook(
@@ -199,6 +205,7 @@ def look_at_series(
         mean_DN=found.mean,
         pair_variance_DN2=found.of_pairs,
         stack_variance_DN2=found.of_stack,
+        unchanged_share=found.unchanged_share,
         saturated_share=saturated / (found.frames * int(good.sum())),
     )
 
@@ -248,15 +255,13 @@ def summarise_series(
     column_count = np.maximum(use.sum(axis=0), 1.0)
     code_parts: list[NDArray[Any]] = []  # whole numbers alone: others have no codes
     coded = 0
-    unchanged = np.zeros(shape, np.float32)
     for raw, x, cleaned, d in _pieces(pieces, good, pattern, name):
-        unchanged += np.count_nonzero(raw[1:] == raw[:-1], axis=0)
         if raw.dtype.kind in "ui" and coded < CODES_FRAMES:
             code_parts.append(raw[: CODES_FRAMES - coded][:, good].ravel())
             coded += min(len(raw), CODES_FRAMES - coded)
         means = np.tensordot(x, use, axes=2).astype(np.float64) / n_good
         frame_means.append(means)
-        d2 = variances.add(x, cleaned, d)
+        d2 = variances.add(raw, x, cleaned, d)
         if len(d):
             if len(d) > 3:
                 inside = (d * d)[:, good] / np.maximum(d2 / len(d), 1e-12)[good]
@@ -306,7 +311,7 @@ def summarise_series(
         frame_mean_DN=np.concatenate(frame_means),
         distinct_codes=distinct,
         code_range=span,
-        unchanged_share=unchanged / np.float32(one),
+        unchanged_share=variances.unchanged_share,
     )
 
 
@@ -317,9 +322,9 @@ def _codes(values: NDArray[np.integer[Any]]) -> tuple[int, int]:
     return there.size, int(there[-1]) - int(there[0]) + 1
 
 
-def rounded_away(summary: SeriesSummary, good: NDArray[np.bool_]) -> bool:
+def rounded_away(seen: SeriesSummary | FirstLook, good: NDArray[np.bool_]) -> bool:
     """Whether most of what the noise of the good pixels (row, column) would do is lost in the steps of the ADC."""
-    return float(np.mean(summary.unchanged_share[good])) > ROUNDED_SHARE
+    return float(np.mean(seen.unchanged_share[good])) > ROUNDED_SHARE
 
 
 def kurtosis_excess(fourth: float, count: float, pairs: int) -> float:

@@ -185,20 +185,19 @@ def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: fl
 
 @lru_cache(maxsize=2)
 def _shapes(size: tuple[int, ...]) -> tuple[NDArray[np.float64], ...]:
-    """Smooth changes (row, column) of the open field, relative: products of Legendre polynomials, SHAPE_SD rms in all.
+    """Smooth changes (row, column) of the open field, relative: SHAPE_SD rms in all."""
+    found = _smooth(size, scales.SHAPE_ORDER)
+    total = math.sqrt(sum(1.0 / order**2 for order, _ in found))
+    return tuple(scales.SHAPE_SD / order / total / float(np.sqrt(np.mean(shape**2))) * shape for order, shape in found)
 
-    Standard deviations fall as one over the order.
-    """
+
+def _smooth(size: tuple[int, ...], highest: int) -> list[tuple[int, NDArray[np.float64]]]:
+    """Products (row, column) of Legendre polynomials, each after its order, 1 to the highest; standard deviations fall as one over it."""
     from numpy.polynomial.legendre import legvander
 
-    down, across = (legvander(np.linspace(-1.0, 1.0, length), scales.SHAPE_ORDER) for length in size)
-    numbers = [(i, k) for i in range(scales.SHAPE_ORDER + 1) for k in range(scales.SHAPE_ORDER + 1 - i) if i or k]
-    total = math.sqrt(sum(1.0 / (i + k) ** 2 for i, k in numbers))
-    result = []
-    for i, k in numbers:
-        shape: NDArray[np.float64] = np.outer(down[:, i], across[:, k])
-        result.append(scales.SHAPE_SD / (i + k) / total / float(np.sqrt(np.mean(shape**2))) * shape)
-    return tuple(result)
+    down, across = (legvander(np.linspace(-1.0, 1.0, length), highest) for length in size)
+    numbers = [(i, k) for i in range(highest + 1) for k in range(highest + 1 - i) if i or k]
+    return [(i + k, np.outer(down[:, i], across[:, k])) for i, k in numbers]
 
 
 def _of_steps(probes: SeriesProbes, name: str) -> float:
@@ -412,19 +411,17 @@ def _waves(shape: tuple[int, ...], count: int) -> dict[tuple[int, int], NDArray[
 
 
 def uneven(probes: SeriesProbes, images: Mapping[int, Map], shape: tuple[int, ...]) -> dict[int, NDArray[np.float64]]:
-    """Responses (2, probe), not shrunk, to more of a change on one side of the panel, along rows and along columns, by key.
+    """Responses (smooth shape, probe), not shrunk, to more of a change in one part of the panel than in another, by key.
 
     A panel seldom warms evenly, and no anode's heel is a straight line. images: what changes do to the mean frame (row, column
     or 1, 1), DN; shape: of the panel, rows and columns.
     """
     if not images:
         return {}
-    rows, columns = shape
-    ramps = np.zeros((2, *shape), np.float32)
-    ramps[0], ramps[1] = np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)[None, :]
+    shapes = np.stack([one / order for order, one in _smooth(shape, scales.SHAPE_ORDER)]).astype(np.float32)
     uneven_ones = [key for key, image in images.items() if image.size > 1]
     # all at once: the projection is larger than a processor's cache
-    under = [ramps, *(images[key] * ramps for key in uneven_ones)]
+    under = [shapes, *(images[key] * shapes for key in uneven_ones)]
     alike, *found = probes.projection.apply(np.stack(under))
     result = {key: float(image.flat[0]) * alike for key, image in images.items()} | dict(
         zip(uneven_ones, found, strict=True)

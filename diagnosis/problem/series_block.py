@@ -37,7 +37,7 @@ class SeriesBlock:
     (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN more in every pixel; brighter (probe,): of 1 %
     more light; pattern (probe, wave), pattern_jitter (probe,) by what the rest of it is: what 1 % of a changed gain map does by
     chance; lines (2, probe): variance of what 1 DN of noise common to rows (to columns) does; lit_lines, alike, of 1 % of the
-    light; uneven (2, probe) by number of change: more of it on one side of the panel; tiles (probe, tile), alike: what 1 % of
+    light; uneven (shape, probe) by number of change: more of it in one part of the panel; tiles (probe, tile), alike: what 1 % of
     changed gains of its tiles does by chance.
     """
 
@@ -149,7 +149,8 @@ def by_chance(
     """
     random = EFFECTS[variant.effect].variation.random
     if random == "sides":
-        sides = np.zeros((sum(map(len, blocks)), 2))
+        shapes = next((len(block.uneven[row]) for block in blocks if row in block.uneven), 0)
+        sides = np.zeros((sum(map(len, blocks)), shapes))
         for block, place in zip(blocks, places_of(blocks), strict=True):
             if row in block.uneven:
                 sides[place] = block.uneven[row].T

@@ -13,7 +13,8 @@ from ..inference.discrepancy import USUAL_LEVEL, law_terms
 from ..inference.inference import UNKNOWN, Hypothesis
 from ..inference.nuisances import LocalNuisances
 from ..inference.observed import Point
-from ..problem.problem import Problem, SeriesView
+from ..problem.problem import Problem
+from ..problem.series_block import SeriesView
 from .strengths import points_on
 
 _DRAWS = 300
@@ -54,9 +55,8 @@ class Gap:
 def folds_of(problem: Problem) -> NDArray[np.intp]:
     """Fold 0 or 1 of each series: alternating in time within each kind, sort of object and tube voltage.
 
-    Where that would leave one fold a single exposure of a voltage and the other fold another one (series at two exposures taken
-    by turns), each goes where there are fewer of its exposure and of those that calibrate as it does: no level tells what
-    exposures do, and no gain map what has changed, unless both are there.
+    Where that would leave either fold a single exposure of a voltage, each its own, series go where there are fewer of their exposure
+    and of those that calibrate as they do: what exposures do, and what has changed, shows only where both are there.
     """
     folds = [0] * len(problem.views)
     beams: Counter[tuple[Any, ...]] = Counter()

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.frames.conditions import with_conditions
 from ...generator.frames.line_model import ExpectedSeries, LineModel
@@ -81,31 +80,12 @@ class ForwardModel:
         return down - base_down, right - base_right
 
     def expect(self, request: SeriesRequest) -> ExpectedSeries:
-        """The series as the base twin expects it.
-
-        Raises:
-            InputError: the twin knows too little for it.
-        """
+        """The series as the base twin expects it; raises as `under`."""
         return self.under(self.unchanged, request)
 
     def expect_changed(self, request: SeriesRequest, change: Change, unchanged: ExpectedSeries) -> ExpectedSeries:
-        """The series under a change: `unchanged` itself where the change cannot show.
-
-        Raises:
-            InputError: the twin knows too little for it.
-        """
+        """The series under a change: `unchanged` itself where the change cannot show; raises as `under`."""
         return self.under(change, request) if change.touches(request) else unchanged
-
-    def expect_all(self, items: Sequence[SessionSeries]) -> tuple[dict[str, ExpectedSeries], list[str]]:
-        """The series as the base twin expects them, by name, and why others cannot be."""
-        expected: dict[str, ExpectedSeries] = {}
-        refused: list[str] = []
-        for item in items:
-            try:
-                expected[item.name] = self.expect(item.request)
-            except InputError as error:
-                refused.append(f"{item.name}: {error}")
-        return expected, refused
 
     def under(self, change: Change, request: SeriesRequest) -> ExpectedSeries:
         """A series under a change, whether that can show there or not.
@@ -117,11 +97,7 @@ class ForwardModel:
         return line.expect(shown)
 
     def from_beyond(self, change: Change, request: SeriesRequest) -> NDArray[np.float64]:
-        """What the surroundings would let into the field of a series under a change, see `LineModel.from_beyond`.
-
-        Raises:
-            InputError: the twin knows too little for it.
-        """
+        """What surroundings would let into the field of a series under a change, see `LineModel.from_beyond`; raises as `under`."""
         line, shown = self._line(change, request)
         return line.from_beyond(shown)
 

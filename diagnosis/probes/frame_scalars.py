@@ -49,16 +49,10 @@ def measured_scalars(
 ) -> list[Scalar]:
     """The scalar probes of measured frames with their standard deviations (sampling and floor together).
 
-    Args:
-        summary: what the frames' noise says.
-        base: the series as the base twin expects it, whose noise the standard deviations come from.
-        context: what the probes refer to.
-        dark_mean_DN: mean of the dark that an afterglow is judged against.
-        pattern: of the corrected mean frame; None: none was looked for.
-        outliers, all_outliers: pixels that stand out in this series, and in any.
-        memory: share of such pixels' variance that lasts from frame to frame, and how many they are.
-        copies: frames of all series that this one stands for, which are copies of earlier ones of their series.
-        lasting: pixels whose level lasts in a later dark.
+    base: as the base twin expects the series; dark_mean_DN: of the dark that an afterglow is judged against; pattern: of the
+    corrected mean frame, None: none was looked for; outliers, all_outliers: pixels that stand out in this series (None: not looked
+    for), and in any; memory: share of such pixels' variance that lasts, and how many they are; copies: frames of all series that
+    this one stands for, which are copies of earlier ones; lasting: pixels whose level lasts in a later dark.
     """
     found = _Found(summary=summary, base=base, context=context)
     if summary.frames > 2 and found.noisy:
@@ -67,10 +61,9 @@ def measured_scalars(
     found.trends()
     found.afterglow(dark_mean_DN)
     found.codes()
-    stands = context.calibrates or context.rounded
-    if pattern is not None and not stands:
+    if pattern is not None:
         found.fixed_pattern(pattern)
-    if outliers is not None and not stands:
+    if outliers is not None:
         found.add("tails", OUTLIERS, "sqrt(pixels)", root_of_count(outliers), COUNT_SD, "pixels")
         if memory is not None and memory[1] >= _LEAST_OUTLIERS and summary.frames >= _LEAST_FRAMES:
             share, count = memory
@@ -135,11 +128,7 @@ class _Found:
 
     @property
     def noisy(self) -> bool:
-        """Whether frames have noise of their own.
-
-        Rounded ones have what their pixels' distances from the next code make of it. A picture that fades without any noise
-        says how fast it fades, which the afterglow's levels say without a law's errors.
-        """
+        """Whether frames have noise of their own: rounded ones and pictures that fade without noise have none."""
         if self.context.rounded:
             return False
         return self.context.kind != "afterglow" or sum(self.means_DN2) > LEAST_NOISE_DN2

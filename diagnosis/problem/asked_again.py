@@ -13,24 +13,8 @@ from ..model.forward_model import strength_rows
 from ..model.responses import Asked, SessionModel
 from ..session.even_maps import full_size
 from .nuisance_columns import Columns, nuisances_of_series
-from .other_scenes import OtherScenes
-from .series_probes import SeriesProbes
+from .series_block import SeriesBlock
 from .surroundings import border_inflow
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ProbedSeries:
-    """One series as the base twin expects it, and what its numbers are.
-
-    Fields: probes; signal_DN (row, column): expected, corrected; scenes: what may stand in its scene's place.
-    """
-
-    probes: SeriesProbes
-    signal_DN: NDArray[np.floating]
-    scenes: OtherScenes
-
-    def __len__(self) -> int:
-        return len(self.probes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +26,7 @@ class AskedAgain:
     """
 
     session: SessionModel
-    series: tuple[ProbedSeries, ...]
+    series: tuple[SeriesBlock, ...]
     steps: tuple[Change, ...]
     done: Mapping[str, NDArray[np.float64]]
     factors: Columns
@@ -105,7 +89,7 @@ class AskedAgain:
                 columns.setdefault(name, np.zeros(len(next(iter(columns.values())))))[place] = column
         return notable(columns)
 
-    def _of_series(self, one: ProbedSeries, found: Asked, asked: Mapping[str, Asked]) -> Columns:
+    def _of_series(self, one: SeriesBlock, found: Asked, asked: Mapping[str, Asked]) -> Columns:
         """Responses (probe,) of one series to nuisances; none where the effects do not change what it shows."""
         at, *others = self.session.moved(one.probes.series, [found, *asked.values()])
         if at is None or not np.any(one.probes.responses([at])):

@@ -33,14 +33,7 @@ _UNKNOWN_GAIN_SD = 0.5  # relative, of the gain of a beam of unknown voltage
 def nuisances_of_series(
     session: SessionModel, probes: SeriesProbes, signal: NDArray[np.float64], redrawn: Redrawn
 ) -> Columns:
-    """Nuisances of one series by name, shrunk.
-
-    Args:
-        session: all series.
-        probes: of the series.
-        signal: expected (row, column), DN.
-        redrawn: what other scenes would show.
-    """
+    """Nuisances of one series by name, shrunk; signal: expected (row, column), DN; redrawn: what other scenes would show."""
     item, model, beams_differ = probes.series.session, session.model, session.model.beams_differ
     columns: Columns = {
         "shape of the noise": probes.of_scalars(lambda probe: scales.KURTOSIS_SD if probe.name == "kurtosis" else 0.0)
@@ -185,10 +178,7 @@ def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: fl
 
 @lru_cache(maxsize=2)
 def _shapes(size: tuple[int, ...]) -> tuple[NDArray[np.float64], ...]:
-    """Smooth changes (row, column) of the open field, relative: products of Legendre polynomials, SHAPE_SD rms in all.
-
-    Standard deviations fall as one over the order.
-    """
+    """Smooth changes (row, column) of the open field, relative: products of Legendre polynomials, SHAPE_SD rms in all."""
     from numpy.polynomial.legendre import legvander
 
     down, across = (legvander(np.linspace(-1.0, 1.0, length), scales.SHAPE_ORDER) for length in size)
@@ -216,11 +206,7 @@ def _few_bad_pixels(probes: SeriesProbes) -> NDArray[np.float64]:
 
 
 def _of_scene(item: SessionSeries, signal: NDArray[np.float64], *, sharp: bool, rough: float) -> _Images:
-    """Where a scene lies and how its outline is drawn.
-
-    signal: expected (row, column), DN; sharp: pixels see no farther than themselves; rough: how far outlines
-    depart from their maps along them, over what is assumed.
-    """
+    """Where a scene lies and how its outline is drawn; rough: how far outlines depart from their maps, over what is assumed."""
     place = _place(item)
     dy, dx = gradient(signal)
     rows, columns = signal.shape
@@ -243,10 +229,7 @@ def _of_scene(item: SessionSeries, signal: NDArray[np.float64], *, sharp: bool, 
 
 
 def _of_spot(sigma_px: float, signal: NDArray[np.float64]) -> _Images:
-    """What another size of the focal spot than the instrument states does: blur that grows with the magnification.
-
-    sigma_px: of its image behind this scene; signal: expected (row, column), DN.
-    """
+    """What another size of the focal spot, sigma_px of its image here, does: blur that grows with the magnification."""
     if sigma_px == 0.0:
         return {}
     more_px2 = 2.0 * scales.SPOT_SD * sigma_px**2
@@ -318,11 +301,7 @@ def _of_thickness(
 
 
 def _gain_map_noise(session: SessionModel, probes: SeriesProbes, signal: NDArray[np.float64]) -> Columns:
-    """Smooth noise of the gain map by shape: what few calibrating frames leave of it is the same in every series.
-
-    Empty where the series has no part in it: before the beam, for those that calibrate, and where the gain map was applied before.
-    signal: expected (row, column), DN.
-    """
+    """Smooth noise of the gain map by shape, as few calibrating frames leave it in every series that it divides."""
     item, maps = probes.series.session, session.maps
     if not item.request.beam_on or item.calibrates or "gain" in item.series.corrected:
         return {}

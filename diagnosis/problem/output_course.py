@@ -62,10 +62,7 @@ class OutputCourse:
 def rms_about_mean(levels: Sequence[float], courses: Sequence[NDArray[np.float64]], noise: Sequence[float]) -> float:
     """Root mean square of all frames' relative output about its mean over them, noise taken off; 0 where noise is all.
 
-    Args:
-        levels: of each series over what is expected, less 1.
-        courses: of each series, frame by frame (frame,), relative, about any level.
-        noise: variance of one frame's level in each series that is no output.
+    Of each series: level over what is expected, less 1; course (frame,), relative; variance of a frame's level that is no output.
     """
     frames = np.array([len(course) for course in courses], dtype=np.float64)
     middle = float(frames @ np.asarray(levels)) / float(frames.sum())

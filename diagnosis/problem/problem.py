@@ -19,26 +19,13 @@ from ..model.curves import Curve
 from ..model.forward_model import draft_cache
 from ..model.responses import SessionModel
 from ..probes.probes import ProbeName
-from ..session.even_maps import Map, full_size
-from ..session.session import SessionSeries
-from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
+from ..session.even_maps import full_size
+from ..session.summaries import LEAST_NOISE_DN2
 from .asked_again import AskedAgain
 from .scenes_apart import scenes_apart
+from .series_block import SeriesView
 
 _WITHOUT_SCENE = 0.07  # time that a series without a scene takes, over that of one with a scene
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SeriesView:
-    """One series with what pictures of the gap need: measured and expected signal (row, column), and the mean's noise."""
-
-    session: SessionSeries
-    summary: SeriesSummary
-    expected: ExpectedSeries
-    signal_DN: Map
-    residual_DN: Map
-    noise_DN: Map
-    mask: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,16 +22,10 @@ _WAYS: tuple[Callable[[Displacement], bool], ...] = (
 def scenes_apart(
     curves: Sequence[Curve], places: Sequence[object | None], names: Sequence[str], series_of: NDArray[np.intp]
 ) -> Curve | None:
-    """What a displacement of each scene by itself does by chance, its rms over all scenes the strength.
+    """What a displacement of each scene by itself does by chance, its rms over all scenes the strength: a curve without a mean.
 
-    Args:
-        curves: of the grid, those of one effect that displaces scenes among them.
-        places: where each series' scene stood; None: it has none.
-        names: of the series.
-        series_of: number of each probe's series (probe,).
-
-    Returns:
-        A curve without a mean response; None: there are not two scenes that such an effect moves.
+    places: where each series' scene stood, None: it has none; series_of: number of each probe's series (probe,). None: there are not
+    two scenes that an effect of the curves moves.
     """
     ways = [next((curve for curve in curves if _moves(curve, way)), None) for way in _WAYS]
     found = [curve for curve in ways if curve is not None]

@@ -8,14 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
+from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.line_state import FixedPattern, TilePattern, between_lines
 from ..model import changes as scales
 from ..model.changes import Variant
 from ..model.curves import places_of
 from ..model.responses import Asked, Moved
-from ..probes.probes import ProbeName
 from ..probes.scalar_context import time_templates
+from ..session.even_maps import Map
 from ..session.session import SessionSeries
+from ..session.summaries import SeriesSummary
 from .nuisance_columns import (
     Columns,
     brighter,
@@ -25,27 +27,41 @@ from .nuisance_columns import (
     offset_of_later,
     uneven,
 )
+from .other_scenes import OtherScenes
 from .output_course import OutputCourse
 from .series_probes import MeanFrame, SeriesProbes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesView:
+    """One series with what pictures of the gap need: measured and expected signal (row, column), and the mean's noise."""
+
+    session: SessionSeries
+    summary: SeriesSummary
+    expected: ExpectedSeries
+    signal_DN: Map
+    residual_DN: Map
+    noise_DN: Map
+    mask: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeriesBlock:
     """The part of a problem that one series makes; its probes are standardised.
 
-    Fields: session; names (one a probe); residual, sd, noise (probe,), as in `Problem`; nuisances (probe,) by name; responses
-    (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN more in every pixel; brighter (probe,): of 1 %
-    more light; pattern (probe, wave), pattern_jitter (probe,) by what the rest of it is: what 1 % of a changed gain map does by
-    chance; lines (2, probe): variance of what 1 DN of noise common to rows (to columns) does; lit_lines, alike, of 1 % of the
-    light; uneven (2, probe) by number of change: more of it on one side of the panel; tiles (probe, tile), alike: what 1 % of
-    changed gains of its tiles does by chance.
+    Fields: view; probes; signal_DN (row, column): expected, corrected; scenes: what may stand in its scene's place; residual
+    (probe,); nuisances (probe,) by name; responses (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN
+    more in every pixel; brighter (probe,): of 1 % more light; pattern (probe, wave), pattern_jitter (probe,) by what the rest of it
+    is: what 1 % of a changed gain map does by chance; lines (2, probe): variance of what 1 DN of noise common to rows (to columns)
+    does; lit_lines, alike, of 1 % of the light; uneven (2, probe) by number of change: more of it on one side of the panel; tiles
+    (probe, tile), alike: what 1 % of changed gains of its tiles does by chance.
     """
 
-    session: SessionSeries
-    names: list[ProbeName]
+    view: SeriesView
+    probes: SeriesProbes
+    signal_DN: NDArray[np.floating]
+    scenes: OtherScenes
     residual: NDArray[np.float64]
-    sd: NDArray[np.float64]
-    noise: NDArray[np.float64]
     nuisances: Columns
     responses: NDArray[np.float64]
     offset: NDArray[np.float64]
@@ -60,23 +76,23 @@ class SeriesBlock:
     def __len__(self) -> int:
         return len(self.residual)
 
+    @property
+    def session(self) -> SessionSeries:
+        """The series."""
+        return self.view.session
+
 
 def series_block(
     probes: SeriesProbes,
     frame: MeanFrame,
+    *,
+    summary: SeriesSummary,
+    scenes: OtherScenes,
     asked: Sequence[Asked],
     moved: Sequence[Moved | None],
     nuisances: Columns,
 ) -> SeriesBlock:
-    """One series in numbers.
-
-    Args:
-        probes: of this series.
-        frame: its mean frame against the model.
-        asked: changes.
-        moved: what each does to this series.
-        nuisances: responses (probe,) by name.
-    """
+    """One series in numbers; moved: what each change that was asked does to it; nuisances: responses (probe,) by name."""
     signal, shrink = frame.signal_DN, probes.shrink
     responses = np.zeros((len(asked), len(probes)))
     known = [(number, found) for number, found in enumerate(moved) if found is not None]
@@ -98,11 +114,19 @@ def series_block(
     }
     lines, context = noise_of_lines(probes) * shrink**2, probes.series.context
     return SeriesBlock(
-        session=probes.series.session,
-        names=probes.names,
+        view=SeriesView(
+            session=probes.series.session,
+            summary=summary,
+            expected=probes.series.expected,
+            signal_DN=np.asarray(signal, np.float32),
+            residual_DN=np.asarray(frame.residual_DN, np.float32),
+            noise_DN=np.sqrt(frame.quantum_DN2 + frame.white_DN2).astype(np.float32),
+            mask=frame.mask,
+        ),
+        probes=probes,
+        signal_DN=signal,
+        scenes=scenes,
         residual=probes.residual(frame.residual_DN),
-        sd=probes.sd,
-        noise=probes.noise,
         nuisances=nuisances,
         responses=responses,
         offset=offset_of_later(probes) * shrink,
@@ -208,13 +232,13 @@ def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: floa
         np.multiply.outer(block.brighter, shares, out=levels[place])
         request = block.session.request
         profiles = dict(time_templates(request.frames))
-        for index, name in enumerate(block.names):
+        for index, (name, sd) in enumerate(zip(block.probes.names, block.probes.sd, strict=True)):
             if name.statistic.startswith("trend"):
                 along = wanders.along(profiles[name.statistic.removeprefix("trend ")], request, readout_ms)
-                single.append((place.start + index, 0.01 * along / math.sqrt(request.frames) / block.sd[index]))
+                single.append((place.start + index, 0.01 * along / math.sqrt(request.frames) / sd))
             elif name.statistic == "frame_factor":
                 steps = wanders.steps(request, readout_ms)
-                single.append((place.start + index, 0.5 * steps / block.sd[index]))
+                single.append((place.start + index, 0.5 * steps / sd))
     alone = np.zeros((size, len(single)))
     for column, (probe, amount_of_one) in enumerate(single):
         alone[probe, column] = amount_of_one

@@ -18,11 +18,6 @@ def border_inflow(
 
     That is what comes in if the picture goes on as it ends, less what comes in if it mirrors. An edge that crosses a border and runs
     on straight lets in twice that. Series of one placement have the same surroundings.
-
-    Args:
-        session: all series as the base twin expects them.
-        series: probes of all of them, in order of time.
-        effect: at a strength; it takes the place of the same one, if the base has that.
     """
     if EFFECTS[effect.id].variation.random != "surroundings":
         return None

@@ -12,7 +12,7 @@ from ...reports import AFTER, BEFORE, Bars, Chart, Line, Picture, Points, Rule
 from ...reports.chart import SERIES_COLOURS, SHAPES, asinh_ticks, rows_px
 from ..inference.inference import title_of
 from ..judgement.answer import Diagnosis
-from ..problem.problem import SeriesView
+from ..problem.series_block import SeriesView
 from ..session.even_maps import NEIGHBOURS_PX
 from .words import axis_text, statistic_text
 
@@ -40,13 +40,9 @@ def _smoothed_z(view: SeriesView, residual: NDArray[np.floating]) -> NDArray[np.
 
 
 def gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]]) -> list[Picture]:
-    """Residual mean frames in units of one pixel's noise, 5 x 5 average: before and after.
+    """Residual mean frames in units of one pixel's noise, 5 x 5 average: before, and after with residuals (row, column), DN.
 
     Series of which the effects take most away come first; where there are none, those with most gap.
-
-    Args:
-        diagnosis: with what was compared.
-        after: (series) residuals (row, column) with the effects added, DN.
     """
     views = diagnosis.compared.views
     pictures = []

@@ -111,10 +111,7 @@ def _middle(curve: Curve) -> float:
 def _usual(
     effect: str, curves: Sequence[Curve], lengths: Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 ) -> int:
-    """Number of the curve that stands for an effect: of its usual onset, if there is one, and of those the middle one in length.
-
-    lengths: of a curve (number) at strengths (strength,), standard deviations.
-    """
+    """Number of the curve that stands for an effect: of its usual onset, if there is one, and of those the middle one in length."""
     own = [number for number, curve in enumerate(curves) if curve.effect == effect]
     onset = EFFECTS[effect].usual_onset
     usual = [number for number in own if curves[number].variant.since == onset] or own
@@ -146,10 +143,7 @@ class Proposal:
 def advice_text(proposals: Sequence[Proposal], first: Sequence[str], second: Sequence[str], *, lately: bool) -> str:
     """What to measure to distinguish two explanations (effects): what settles it, or, where nothing does, what isolates them.
 
-    Args:
-        proposals: what was weighed, the best one of each kind.
-        first, second: the effects of the explanations.
-        lately: all of them came after the calibration: what that has not seen cannot be made up for.
+    proposals: the best one of each kind; lately: all effects came after the calibration, which has not seen them.
     """
     names = " from ".join(" and ".join(map(title_of, effects)) for effects in (first, second))
     best = next((item for item in proposals if item.settles), None)
@@ -177,12 +171,7 @@ def advice_text(proposals: Sequence[Proposal], first: Sequence[str], second: Seq
 
 
 def best_repeat(problem: Problem, first: Sequence[Point], second: Sequence[Point]) -> Proposal | None:
-    """The series whose repetition would separate two explanations most; None where they are alike everywhere.
-
-    Args:
-        problem: of the session.
-        first, second: effects of either explanation, with curves of the problem.
-    """
+    """The series whose repetition would separate two explanations most; None where they are alike everywhere."""
 
     def response(explanation: Sequence[Point]) -> NDArray[np.float64]:
         return sum((one.curve.response(one.strength) for one in explanation), np.zeros(len(problem.residual)))
@@ -212,13 +201,7 @@ def best_repeat(problem: Problem, first: Sequence[Point], second: Sequence[Point
 
 
 def length(factors: NDArray[np.float64], blocks: NDArray[np.intp], moved: NDArray[np.float64]) -> float:
-    """Length of a change of the probes (probe,), standard deviations, nuisances refitted.
-
-    Args:
-        factors: of the nuisances (probe, factor).
-        blocks: within which they are local (probe,).
-        moved: the change.
-    """
+    """Length of a change of the probes (probe,), sd, nuisances (probe, factor), local in blocks (probe,), refitted."""
     whitening = Whitening(factors, blocks)
     whitened = whitening.apply(moved[None, :])
     return math.sqrt(max(float(Nuisances(whitening.factors).inner(whitened, whitened)[0, 0]), 0.0))

@@ -100,14 +100,7 @@ def plan_session(
     without: Sequence[str] = (),
     progress: Callable[[str], None] | None = None,
 ) -> SessionPlan:
-    """The distinguishability matrix of a session's series.
-
-    Args:
-        acquisition, twin, rng, without, progress: as `diagnose`.
-
-    Raises:
-        InputError: nothing in the session can be judged.
-    """
+    """The distinguishability matrix of a session's series; arguments and errors are those of `diagnose`."""
     # thousands of small matrices: threads would wait for each other longer than they work
     with threadpool_limits(limits=1, user_api="blas"):
         session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)

@@ -63,15 +63,10 @@ def _over_levels(by_level: NDArray[np.float64], frequencies: Sequence[float]) ->
 
 
 def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS) -> CurveFit:
-    """Evidence of one curve over none, its strength integrated over a log-uniform prior, see `log_integral`.
+    """Evidence of one curve, in the units of the first probes, over none, its strength integrated out, see `log_integral`.
 
     What an effect does by chance grows with its strength; at each level the covariance is that of the law at its best strength, found
     in rounds.
-
-    Args:
-        observed: what is weighed.
-        curve: in the units of the first probes.
-        levels: of discrepancy.
     """
     scaled = observed.scaled(curve)
     (sharp,) = _Terms.of_each(observed, [scaled])
@@ -111,13 +106,13 @@ def fit_effect(observed: Observed, curve: Curve) -> CurveFit:
 
 def first_looks_at_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
     """The same of several curves with their laws taken as exact."""
-    given = [curve for curve in curves if observed.has(curve.effect)]
-    others = [curve for curve in curves if not observed.has(curve.effect)]
-    found = dict(zip(map(id, others), first_looks(observed.conditioned(), others), strict=True))
-    for curve in given:
-        (fit,) = first_looks(observed.conditioned(curve.effect), [curve])
-        found[id(curve)] = _over_given(observed, fit)
-    return [found[id(curve)] for curve in curves]
+    others = iter(first_looks(observed.conditioned(), [curve for curve in curves if not observed.has(curve.effect)]))
+    return [
+        _over_given(observed, first_looks(observed.conditioned(curve.effect), [curve])[0])
+        if observed.has(curve.effect)
+        else next(others)
+        for curve in curves
+    ]
 
 
 def _over_given(observed: Observed, fit: CurveFit) -> CurveFit:

@@ -22,15 +22,10 @@ class InSome:
 
 
 def in_some_series(observed: Observed, fits: Sequence[CurveFit], series_of: NDArray[np.intp]) -> InSome | None:
-    """In which series one effect acts; None: no part of them explains more than all.
+    """In which series one effect, of these fits, acts; None: no part of them explains more than all.
 
     Series are taken in one after the other, the one that explains most first, law and nuisances as in a fit to all. Any number of
-    series is as likely as another, and so are all sets of so many.
-
-    Args:
-        observed: what is weighed.
-        fits: of the effect's curves to it.
-        series_of: number of each probe's series (probe,).
+    series is as likely as another, and so are all sets of so many. series_of: number of each probe's series (probe,).
     """
     best: InSome | None = None
     most = 0.0

@@ -174,10 +174,8 @@ def _weighed(
         if alone.log_evidence > leaks.get(strong, singles[strong]).log_evidence:
             leaks[strong] = alone
     weighed += [(item, of_single) for item in leaks.values()]
-    of_one = float(np.logaddexp.reduce(alike)) - math.log(count) if alike else -math.inf
-    of_two = (
-        float(np.logaddexp.reduce(like_two)) - math.log(max(count * (count - 1) // 2, 1)) if like_two else -math.inf
-    )
+    of_one = float(np.logaddexp.reduce(alike)) - math.log(count)
+    of_two = float(np.logaddexp.reduce(like_two)) - math.log(max(count * (count - 1) // 2, 1))
     # like none of the catalogue, like one or like two, each as likely
     evidence = float(np.logaddexp.reduce([none.log_evidence, of_one, of_two])) - math.log(3.0)
     unknown = Hypothesis(effects=(UNKNOWN,), probability=0.0, log_evidence=evidence, location=none.place)
@@ -188,10 +186,7 @@ def _weighed(
 def _left_by_given(
     observed: Observed, singles: Mapping[str, Single], weighed: Mapping[str, Hypothesis]
 ) -> float | None:
-    """Log evidence over none of what laws of the twin's own effects leave in the shape of another; None: the twin has none.
-
-    weighed: each effect alone, with a misfit or without.
-    """
+    """Log evidence over none of what laws of the twin's own effects leave in the shape of another; None: the twin has none."""
     given = [point.effect for point in observed.given]
     others = [one for one in singles if one not in given and any(may_leave(effect, one) for effect in given)]
     if not others:

@@ -197,7 +197,14 @@ class LocalNuisances:
 
     def fitted(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
         """Most probable nuisances (factor,), in prior standard deviations, for a residual (probe,)."""
-        return np.asarray(self._solved((self.factors.T @ vector)[:, None])[:, 0])
+        half = self._halved((self.factors.T @ vector)[:, None])
+        across = _half(self._cholesky, half[self._across], transposed=True)
+        half[self._across] = across
+        for part, lower, coupling in self._parts:
+            half[part] = _half(lower, half[part] - coupling @ across, transposed=True)
+        result = np.empty(len(half))
+        result[self._order] = half[:, 0]
+        return result
 
     def solve(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
         """C^-1 vector (probe,)."""
@@ -229,17 +236,6 @@ class LocalNuisances:
             across[:, there] -= coupling.T @ own
         right[self._across] = _half(self._cholesky, across)
         return right
-
-    def _solved(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(I + F^T F)^-1 of (factor, vector)."""
-        half = self._halved(right)
-        across = _half(self._cholesky, half[self._across], transposed=True)
-        half[self._across] = across
-        for part, lower, coupling in self._parts:
-            half[part] = _half(lower, half[part] - coupling @ across, transposed=True)
-        result = np.empty_like(half)
-        result[self._order] = half
-        return result
 
 
 def local_columns(

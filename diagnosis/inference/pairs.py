@@ -55,15 +55,10 @@ class Pair:
 def weigh_pairs(
     observed: Observed, singles: Mapping[str, Single], *, leading: int, beside: Sequence[Curve] = ()
 ) -> list[Pair]:
-    """The effects that explain most, so many as `leading` says, each with every other one: those that are likely at first sight.
+    """The `leading` effects that explain most, each with every other one: those that are likely at first sight.
 
     Of each of them the pair with its best companion is among these, and so is the pair that explains most if all laws are exact.
-
-    Args:
-        observed: what is weighed.
-        singles: all effects, by id.
-        leading: how many effects are the first of a pair.
-        beside: curves of effects as they respond beside another.
+    beside: curves of effects as they respond beside another.
     """
     if len(singles) < 2:
         return []
@@ -107,8 +102,7 @@ def weigh_pairs(
 def _together_exactly(observed: Observed, singles: Mapping[str, Single]) -> tuple[CurveFit, Point, str] | None:
     """The two effects that explain most together if their laws are exact: fit and place of the one that explains more, and the other.
 
-    Alone, each counts what the other does as its law's error, so that neither need be among those that explain most. Responses are
-    taken as straight in the strength; effects that the twin has, or that only act by chance, take no part.
+    Alone, each counts what the other does as its law's error. Responses are taken as straight in the strength.
     """
     fits = [
         fit

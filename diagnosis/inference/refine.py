@@ -44,13 +44,8 @@ def refine(
 ) -> list[tuple[Variant, NDArray[np.float64]]]:
     """Variants nearer to what was measured than those of the grid, with their responses (strength, probe).
 
-    Args:
-        hypotheses: of the first weighing, with whitened curves.
-        curves: of the grid, whitened.
-        observed: what is weighed, whitened.
-        respond: asks the forward model.
-        whitening: of responses.
-        blocks: of series that share local nuisances; the search asks those that tell most. None: it asks all.
+    Hypotheses of the first weighing, curves of the grid and `observed` are whitened; blocks: of series that share local nuisances, of
+    which the search asks those that tell most (None: all).
     """
     whole = FitTarget(observed=observed, respond=respond, whitening=whitening, blocks=blocks)
     refinement = _Refinement(whole, curves)
@@ -149,10 +144,7 @@ def _separation(fit: CurveFit, seen: FitTarget) -> float:
 
 
 def _displaced_and_distorted(fits: Sequence[CurveFit], placement: Placement) -> list[CurveFit]:
-    """A displacement that shifts as the best mere shift does, and enlarges or turns as the best that does so.
-
-    From either alone no small step of the angles leads to the other. Empty: one of them is not seen.
-    """
+    """A displacement that shifts as the best mere shift does, and distorts as the best that does so: no small step leads there."""
     best: dict[bool, tuple[CurveFit, dict[str, float]]] = {}
     for fit in sorted(fits, key=lambda item: item.log_evidence):
         parameters = {**fit.curve.variant.parameters, "strength": fit.best}
@@ -168,10 +160,9 @@ def _displaced_and_distorted(fits: Sequence[CurveFit], placement: Placement) -> 
 
 
 def _starts_of(fits: Sequence[CurveFit], several: bool) -> list[CurveFit]:
-    """The best on the grid, which is not always the one that leads furthest, and another: of the other onset if any is near.
+    """The best on the grid, and another: of the other onset if any is near, else, with `several`, the second best.
 
-    A law as good as exact and one that is off on the grid cannot be weighed against each other: where a share of the
-    evidence speaks for either onset, both are refined. several: the second best, too, where that has the same onset.
+    A law as good as exact and one that is off on the grid cannot be weighed against each other.
     """
     ranked = sorted(fits, key=lambda item: -item.log_evidence)
     if not ranked:

@@ -55,10 +55,7 @@ def searched(start: CurveFit, seen: FitTarget) -> tuple[Variant, NDArray[np.floa
 
 
 def _centred(found: "_Found", like: Curve, seen: FitTarget) -> tuple[Variant, NDArray[np.float64]] | None:
-    """A variant at nodes about the strength that all probes want, with its responses (strength, probe).
-
-    A response that saturates is known near its nodes only: they are laid where the strength turns out to be.
-    """
+    """A variant at nodes about the strength that all probes want, as responses that saturate are known near them only."""
     strength = found.fit.best
     final = _answered(found.variant, strength, seen.respond)
     for _ in range(_CENTRINGS):
@@ -144,10 +141,7 @@ class _Search:
         return _Found(here, slopes)
 
     def _stepped(self, start: CurveFit, part: Sequence[Parameter], slopes: "Slopes") -> tuple[CurveFit, float]:
-        """The best along a step towards where the probes want some parameters, the start itself where none is better.
-
-        With the log evidence that the whole step would gain were responses straight lines.
-        """
+        """The best along a step of some parameters, else the start, and the log evidence that straight lines promise."""
         steps, hoped = _newton(start, slopes, self._seen)
         here, variant = start, start.curve.variant
         for share in self._shares:
@@ -237,8 +231,7 @@ def _plausible(here: CurveFit) -> float:
 def _newton(here: CurveFit, slopes: Slopes, seen: FitTarget) -> tuple[dict[str, float], float]:
     """Steps of the inner parameters, each in half of its range, towards where the probes want them, and what they should gain.
 
-    Least squares in the parameters and the strength together, responses taken as straight lines near here, the law off
-    as usual, each parameter within its range: what one would do beyond its end, the others do otherwise.
+    Least squares in parameters, each within its range, and strength, responses taken as straight lines and the law off as usual.
     """
     strength = _plausible(here)
     at, wide = here.curve.response(strength), seen.widened(here.curve, strength)

@@ -37,12 +37,9 @@ class Blocks:
     costs: NDArray[np.float64]
 
     def telling(self, tells: NDArray[np.float64]) -> NDArray[np.bool_] | None:
-        """Probes (probe,) of the blocks that tell most for what they cost; None: nearly all are needed.
+        """Probes (probe,) of the blocks that tell most, by what each probe tells, for what they cost; None: nearly all are needed.
 
         Blocks that cost less than a tenth of the dearest are always among them: they say what nuisances do.
-
-        Args:
-            tells: what each probe tells (probe,).
         """
         of_block = np.maximum(np.bincount(self.of, weights=tells, minlength=len(self.costs)), 0.0)
         kept = self.costs < 0.1 * self.costs.max()

@@ -18,12 +18,7 @@ class Steady:
     """The part of a curve that is in proportion in all series of one beam and scene."""
 
     def __init__(self, curves: Sequence[Curve], alike: NDArray[np.intp], whitening: Whitening) -> None:
-        """
-        Args:
-            curves: of all effects, not whitened: the steady ones among them say what is in proportion.
-            alike (probe,): the same number for one probe of the mean frame in series of one beam and scene.
-            whitening: of the curves that are asked for.
-        """
+        """From curves of all effects, not whitened, and a number (probe,) that probes of one beam and scene share."""
         self._whitening = whitening
         steady = [curve.responses[-1] for curve in curves if curve.variant.course == "steady"]
         self._groups = [(members, _directions(np.stack(steady), members)) for members in _of_one_size(alike) if steady]

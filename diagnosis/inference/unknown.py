@@ -133,11 +133,8 @@ def _at_each(
 ) -> NDArray[np.float64]:
     """Log likelihood (weight,) with the probes of one group counting so much, but for a constant that they do not change.
 
-    Args:
-        weights: of these probes, one over their variance (weight,).
-        rest: Cholesky factor of the precision of the nuisances that all others leave (factor, factor).
-        vector: what the others say of the nuisances (factor,).
-        factors, residual: of the group's probes (probe, factor), (probe,).
+    weights: one over these probes' variance (weight,); rest: Cholesky factor of the precision of nuisances that all others leave
+    (factor, factor); vector: what these say of them (factor,); factors (probe, factor) and residual (probe,): of the group.
     """
     from scipy.linalg import solve_triangular
 

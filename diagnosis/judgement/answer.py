@@ -198,13 +198,7 @@ def improved(twin: Twin, added: Sequence[AppliedEffect]) -> Twin:
 
 
 def in_pixels(diagnosis: Diagnosis, *, twin: Twin, factor: int) -> Diagnosis:
-    """A diagnosis made with squares of pixels, in terms of the panel's pixels.
-
-    Args:
-        diagnosis: of the binned session.
-        twin: the panel's own, calibrated from the same series.
-        factor: pixels along each side of a square.
-    """
+    """A diagnosis made with squares of `factor` pixels a side, in terms of the panel's pixels; twin: the panel's own."""
     added = tuple(
         replace(item, parameters=parameters_in_pixels(item.id, item.parameters, factor)) for item in diagnosis.added
     )

@@ -107,8 +107,6 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
         part = in_some_series(observed.conditioned(), of_effect, problem.series_of)
         if part is not None:
             problem = problem.in_series(part.variant, part.series, part.log_prior)
-            more = whitening.curves(problem.curves[len(whitened) :])
-            whitened, fits = (*whitened, *more), [*fits, *fit_effects(observed, more)]
     problem = problem.with_scenes_apart()
     more = whitening.curves(problem.curves[len(whitened) :])
     whitened, fits = (*whitened, *more), [*fits, *fit_effects(observed, more)]
@@ -285,10 +283,7 @@ def _causes(
     shares: Mapping[str, tuple[float, float, float] | None],
     left: tuple[Place, ...],
 ) -> tuple[Cause, ...]:
-    """Effects that are named, tied or not out of the question, most probable first.
-
-    shares: how far each shrinks the gap; left: where what is named leaves most.
-    """
+    """Effects that are named, tied or not out of the question, or whose `shares` of the gap are known, most probable first."""
     marginal = _by_effect(verdict.hypotheses)
     marginal.pop(UNKNOWN, None)
     named = verdict.named
@@ -437,10 +432,7 @@ def _out_of_reach(problem: Problem, curves: Sequence[Curve], observed: Observed)
 def _next_measurement(
     problem: Problem, tied: Sequence[Hypothesis], rng: np.random.Generator
 ) -> Mapping[str, Any] | None:
-    """What to measure to distinguish the two likeliest explanations, found from the forward model and its noise.
-
-    A series taken again where that settles it, else the measurement that the session lacks which does.
-    """
+    """What distinguishes the two likeliest explanations: a series taken again where that settles it, else a new one."""
     if len(tied) < 2:
         return None
     first, second = ([item.point(effect) for effect in item.effects] for item in tied[:2])

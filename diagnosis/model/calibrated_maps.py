@@ -110,12 +110,7 @@ def exposure_of(item: SessionSeries) -> float:
 
 
 def calibrated_maps(seen: Sequence[SeenSeries], *, twin: Twin, good: NDArray[np.bool_]) -> CalibratedMaps:
-    """Dark and gain map from the calibrating series among those that can be compared.
-
-    Args:
-        seen: series that can be compared.
-        twin: calibrated; its own maps stand in where no series calibrates.
-        good: pixels that are not known to be bad (row, column).
+    """Dark and gain map from the calibrating series among those seen, the twin's own where none calibrates; good (row, column).
 
     Raises:
         InputError: next to no pixel sees light.
@@ -200,11 +195,7 @@ def _gain_of_twin(twin: Twin) -> NDArray[np.float64]:
 
 
 def _gain_noise_of_twin(twin: Twin) -> tuple[float, float]:
-    """Relative variance of one pixel of `_gain_of_twin` by noise: of quanta, and white.
-
-    Raises:
-        InputError: a flat does not say of how many exposures it is the mean, or at which signal.
-    """
+    """Relative variance of one pixel of `_gain_of_twin` by noise: of quanta, and white; raises where a flat does not tell it."""
     quantum = white = 0.0
     for level in twin.levels:
         if not level.signal_DN or not level.exposures:

@@ -248,11 +248,8 @@ class _Misplaced:
 def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
     """The variants of an effect that compete: ends and middle of each inner parameter, both signs, both onsets.
 
-    side: of the squares of the panel's pixels that frames have for pixels; lengths in pixels and what is counted by pixel
-    are those of the panel.
-
-    What calibration takes in whole (a constant kV offset, filtration, gain map, more noise) is no gap and is tried as setting in
-    after it; what acts on objects alone is the same either way; the rest is tried both ways.
+    side: of the squares of the panel's pixels that frames have for pixels. What calibration takes in whole (a constant kV offset,
+    filtration, gain map, more noise) is tried as setting in after it; what acts on objects alone is the same either way.
     """
     strength, *others = (per_bin(item, side) for item in effect.parameters)
     inner = [item for item in others if item.fitted]
@@ -317,7 +314,16 @@ def with_pauses(variants: Sequence[Variant], *, stated: bool) -> list[Variant]:
         grown = [variant]
         for item in EFFECTS[variant.effect].parameters:
             if item.tried_without_times and item.name not in variant.parameters:
-                grown = [_with_tried(one, item, value) for one in grown for value in item.tried_without_times]
+                grown = [
+                    replace(
+                        one,
+                        name=f"{one.name}, {item.name} {value:g}",
+                        parameters={**one.parameters, item.name: value},
+                        fitted=(*one.fitted, item),
+                    )
+                    for one in grown
+                    for value in item.tried_without_times
+                ]
         result += grown
     return result
 
@@ -341,16 +347,6 @@ def with_seams(variants: Sequence[Variant], seen: SeenSeams | None) -> list[Vari
             }
             result.append(replace(variant, parameters={**variant.parameters, **places}, log_prior=seen.log_prior))
     return result
-
-
-def _with_tried(variant: Variant, item: Parameter, value: float) -> Variant:
-    """The variant with one more inner parameter, from a value."""
-    return replace(
-        variant,
-        name=f"{variant.name}, {item.name} {value:g}",
-        parameters={**variant.parameters, item.name: value},
-        fitted=(*variant.fitted, item),
-    )
 
 
 def catalogue_variants(*, without: Sequence[str] = (), side: int = 1) -> list[Variant]:
@@ -398,9 +394,7 @@ def departures_found(posterior: SpectralPosterior | None) -> float:
 def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[Change]:
     """Steps in what calibration has fitted, each with the step's size in prior standard deviations (`spectral_sds`).
 
-    Args:
-        twin: as asked.
-        spectral_steps: size of a step over the posterior's standard deviation.
+    spectral_steps: size of a step over the posterior's standard deviation.
     """
     noise, spread, read = twin.noise, twin.noise.spread, twin.noise.read_noise_DN
 

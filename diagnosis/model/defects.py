@@ -32,12 +32,7 @@ class StandingOut:
 
 
 def new_outliers(seen: Sequence[SeenSeries], maps: CalibratedMaps) -> StandingOut:
-    """Pixels in use that stand out in any dark or flat, or in all objects from some time on.
-
-    Args:
-        seen: series that can be compared.
-        maps: dark and gain map of the calibrating series.
-    """
+    """Pixels in use that stand out in any dark or flat, or in all objects from some time on."""
     good, shape = maps.good, maps.good.shape
     outlying, dusty = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     for one in seen:
@@ -80,10 +75,7 @@ def _without_areas(outlying: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _out_in_every_object(seen: Sequence[SeenSeries], maps: CalibratedMaps) -> NDArray[np.bool_]:
-    """Pixels that stand out of their neighbours whatever lies before them, from some time on: no dark or flat need follow.
-
-    A view in which a step of the object passes by a pixel tells nothing of it.
-    """
+    """Pixels that stand out of their neighbours in nearly all later views, of several scenes, in which no step passes by them."""
     from scipy.ndimage import median_filter
 
     good = maps.good

@@ -74,16 +74,15 @@ class MeasuredScenes:
 
 
 def place_scenes(seen: Sequence[SeenSeries], measured: MeasuredScenes) -> PlacedSeries:
-    """Registers every scene, all series of a place together.
-
-    Args:
-        seen: series that can be compared, scenes where their maps have them.
-        measured: what they are placed by.
-    """
+    """Registers every scene, all series of a place together."""
     placed = {one.name: one for one in seen}
     placements: dict[str, Placement] = {}
     telling: dict[str, SeriesRequest] = {}
-    for stated in _places(seen).values():
+    places: dict[tuple[str, float], list[SeenSeries]] = {}
+    for one in seen:
+        if one.session.series.kind == "object":
+            places.setdefault(one.session.place, []).append(one)
+    for stated in places.values():
         members, placement = _as_drawn(stated, measured)
         if placement is None:
             continue
@@ -109,20 +108,10 @@ def _light_DN(one: SeenSeries) -> float:
     return exposures * float(np.mean(one.expected.signal_DN))
 
 
-def _places(seen: Sequence[SeenSeries]) -> dict[tuple[str, float], list[SeenSeries]]:
-    """Object series by where their scene stood."""
-    places: dict[tuple[str, float], list[SeenSeries]] = {}
-    for one in seen:
-        if one.session.series.kind == "object":
-            places.setdefault(one.session.place, []).append(one)
-    return places
-
-
 def _as_drawn(members: Sequence[SeenSeries], measured: MeasuredScenes) -> tuple[Sequence[SeenSeries], Placement | None]:
     """Series of one place with the maps that show their scene more truly, and where it lies.
 
-    A straight or round border is drawn as its map has it or as it runs: a map of few points a pixel has stairs, which real pixels,
-    that see their whole square, have not; most simulations see the middle of it.
+    A map of few points a pixel has stairs along a straight or round border; a pixel that sees its whole square has none.
     """
     placement = _placement(members, measured)
     asked = members[0].session.request
@@ -182,10 +171,7 @@ def _smeared(
     clean: NDArray[np.bool_],
     found: Placement,
 ) -> tuple[Placement, _Blur]:
-    """Where a scene lies whose pictures are smeared by more than their slopes show, and the blur that leaves least of them.
-
-    The blur goes along the belt in proportion to the exposure, or to all sides; none, where the least of either leaves no less.
-    """
+    """Where a scene lies whose pictures are smeared by more than slopes show, and the blur that leaves least of them."""
     from scipy.ndimage import gaussian_filter, uniform_filter1d
 
     exposures_ms = [item.request.exposure_ms for item in members]
@@ -206,7 +192,7 @@ def _smeared(
 
     # smeared, it may be found far from where it lies
     unmoved = replace(found, row_px=0.0, column_px=0.0)
-    best: tuple[Placement, _Blur, float] = found, _as_it_is, left_over(seen, pictured, clean, found)
+    best: tuple[Placement, _Blur, float] = found, lambda pictures: pictures, left_over(seen, pictured, clean, found)
     for make, sizes in ((box, _BOXES_PX), (gaussian, _GAUSSIANS_PX)):
         here = best[2]
         tried = [make(size)(pictured) for size in sizes[:_SMEARED_SIZES]]
@@ -223,10 +209,6 @@ def _smeared(
             if here < best[2]:
                 best = placed, blur, here
     return best[0], best[1]
-
-
-def _as_it_is(pictures: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.float64]]:
-    return pictures
 
 
 def inside(mask: NDArray[np.bool_], placement: Placement) -> NDArray[np.bool_]:

@@ -201,13 +201,9 @@ class SessionModel:
     def with_patterns(
         self, one: SeriesModel, values: Mapping[str, float], lines: Lines, moved: Map
     ) -> Mapping[str, float]:
-        """Scalars with what line noise leaves in dark and gain map, and what a moved picture shows of pixels, blocks and lines.
+        """Scalars with what lines of calibrating series leave in dark and gain map, and a moved picture in pixels and lines.
 
-        Args:
-            one: the series.
-            values: its scalar probes without that, by name.
-            lines: of the calibrating series.
-            moved: change of the corrected mean frame (row, column or 1, 1), DN.
+        values: scalar probes without that, by name; moved: change of the corrected mean frame (row, column or 1, 1), DN.
         """
         if FIXED not in values:
             return values
@@ -236,11 +232,7 @@ class SessionModel:
         return {name: away + change.displacement.get(name, 0.0) for name, away in carried.items()}
 
     def under(self, one: SeriesModel, asked: Asked) -> SeriesModel:
-        """One series as it is expected under a change that can show there; what line noise leaves in maps aside.
-
-        Raises:
-            InputError: the twin knows too little for it.
-        """
+        """One series under a change that can show there, less what line noise leaves in maps; raises as `ForwardModel.under`."""
         expected = self.model.under(*self._found(one, asked.change))
         return replace(one, expected=expected, scalars={**one.scalars, **expected_scalars(expected, one.context)})
 
@@ -256,11 +248,7 @@ class SessionModel:
         return self.model.from_beyond(*self._found(one, change))
 
     def _alone(self, one: SeriesModel, change: Change, known: Known) -> tuple[ExpectedSeries, Map, Mapping[str, float]]:
-        """A series under a change, its mean frame's change (DN) and its scalar probes, dark and gain map left as they were.
-
-        Raises:
-            InputError: the twin knows too little for it.
-        """
+        """A series under a change, its mean frame's change (DN) and its scalar probes, dark and gain map left as they were."""
         shown, request = self._found(one, change)
         own = shown.whenever_it_began(request)
         if own in known:
@@ -286,13 +274,7 @@ def session_model(
 ) -> SessionModel:
     """The session's series as the base twin expects them, with what their scalar probes refer to.
 
-    Args:
-        model: the base twin.
-        maps: dark and gain map of the calibrating series.
-        placed: series with their scenes drawn where they lie.
-        summaries: what the frames' noise says, by name of series.
-        clean: pixels in use that do not stand out (row, column).
-        lines_DN2: variance of rows and columns from exposure to exposure that the panel has all the time, DN^2.
+    summaries: by name of series; clean: pixels in use that do not stand out (row, column); lines_DN2: as in `SessionModel`.
     """
     seen = placed.seen
     signals_DN = {one.name: mean_over(one.expected.signal_DN, clean) for one in seen}

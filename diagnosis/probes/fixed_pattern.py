@@ -41,11 +41,7 @@ def pattern_noise(
     *,
     lines: bool,
 ) -> Pattern:
-    """What noise alone leaves in the corrected mean frame.
-
-    map_quantum_DN2, map_white_DN2: noise that dark and gain map bring in, correlated as quanta are, and white. lines: whether
-    lines can be judged.
-    """
+    """What noise of frames and of maps (correlated as quanta are, and white) leaves in the corrected mean frame."""
     q = mean_over(model.quantum_variance_DN2, mask) / frames + map_quantum_DN2
     w = max(mean_over(model.white_variance_DN2, mask), LEAST_NOISE_DN2) / frames + map_white_DN2
     # fewer pixels of a line count than it has
@@ -90,11 +86,7 @@ def shares_of_pixels(shape: tuple[int, int], field: FixedPattern) -> Pattern:
 
 @lru_cache(maxsize=64)
 def shares_of_tiles(shape: tuple[int, int], tiles: TilePattern) -> Pattern:
-    """What gains of tiles of variance 1 DN^2 add to a pattern over a panel of `shape`.
-
-    All of these are differences of neighbours, so that each is a sum over the tiles of squared differences of the shares that
-    neighbours have in a tile.
-    """
+    """What gains of tiles of variance 1 DN^2 add to a pattern over a panel: of each tile, differences of neighbours' shares in it."""
     of_axes = tiles.rows.tile_of(shape[0]), tiles.columns.tile_of(shape[1])
     row_in, column_in = (np.eye(int(number[-1]) + 1)[number] for number in of_axes)
 
@@ -156,11 +148,7 @@ def pattern_statistics(
 ) -> Pattern:
     """What stands in a flat's or dark's residual map (row, column), DN.
 
-    Args:
-        residual: measured mean frame less the model's.
-        signal_DN: expected signal of a flat (row, column); None: lines are not judged.
-        clean: pixels without those that stand out.
-        good: all pixels in use.
+    signal_DN: expected of a flat (row, column), None: lines are not judged; clean: pixels in use (`good`) that do not stand out.
     """
     level = residual - smooth_part(residual, clean)
     pair = clean[:, 1:] & clean[:, :-1]
@@ -222,8 +210,7 @@ def count_outliers(
 ) -> int:
     """Good pixels of a residual map (row, column) that stand out of noise (variance, DN^2), pattern and the clean ones around.
 
-    An edge that a picture left in a residual is none of its pixels' own: beside it neighbours differ as much. least_DN (row,
-    column): departures below it make no bad pixel, such as dust on a flat.
+    Beside an edge that a picture left neighbours differ as much. least_DN (row, column): departures below it are dust, no bad pixel.
     """
     level = residual - smooth_part(residual, clean)
     limit = OUTLIER_SD * np.sqrt(variance)

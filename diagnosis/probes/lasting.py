@@ -68,9 +68,7 @@ def lasting_pixels(
 def chances(law: TelegraphPixels | None, darks: tuple[tuple[int, int], ...]) -> tuple[float, list[float], float]:
     """Chances of a pixel that jumps: its level lasts in any dark; it stands out in each, or in any, but lasts in none.
 
-    Args:
-        law: None: no pixel jumps.
-        darks: frames of each dark, and exposures a frame.
+    darks: frames of each dark, and exposures a frame.
     """
     if law is None or law.share == 0.0 or not darks:
         return 0.0, [0.0] * len(darks), 0.0

@@ -136,11 +136,7 @@ class MapProjection:
 
 
 def _separated(table: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Kernels (part, tap) along rows and along columns whose products add up to an autocovariance, a quarter of each as of the table.
-
-    A spread that no effect has changed is one such product. Lags that the table does not hold are 0: the loops
-    read REACH of them, whatever they are given.
-    """
+    """Kernels (part, tap) along rows and along columns whose products add up to an autocovariance, 0 beyond what its table holds."""
     taps = np.zeros((1 + REACH, 1 + REACH))
     known = table[: 1 + REACH, : 1 + REACH]
     taps[: known.shape[0], : known.shape[1]] = known

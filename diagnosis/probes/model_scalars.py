@@ -71,10 +71,7 @@ def expected_scalars(
 
 
 def _noise_scalars(expected: ExpectedSeries, context: ScalarContext, profile: NDArray[np.float64]) -> dict[str, float]:
-    """Noise by label and of whole frames: variance, correlation of neighbours, lines, blocks, times and tails.
-
-    profile: change of the mean from frame to frame (n,), DN.
-    """
+    """Variance, correlation, lines, blocks, times and tails of the noise; profile (n,): course of the mean, DN."""
     values: dict[str, float] = {}
     areas = context.areas
     rows, columns = context.good.shape

@@ -176,13 +176,7 @@ def left_over(
     mask: NDArray[np.bool_],
     placement: Placement,
 ) -> float:
-    """Sum of the squares that pictures leave of measured ones at a placement, levels free, each over its highest signal squared.
-
-    Args:
-        measured, expected: signals (row, column), DN, of each series.
-        mask: pixels to use.
-        placement: where the scene is taken to lie.
-    """
+    """Sum of the squares that pictures leave of measured ones (row, column), levels free, each over its highest signal squared."""
     total = 0.0
     for image, model in zip(measured, expected, strict=True):
         picture, level = resample(fill(image, mask), placement)[mask], np.asarray(model, dtype=np.float64)[mask]
@@ -292,10 +286,7 @@ def register_drawn(
 
 
 def _vertex(left: Callable[[tuple[int, int]], float], step: tuple[int, int]) -> NDArray[np.float64]:
-    """Where beside a whole displacement (2,), px, a parabola through what whole pixels around it leave is least.
-
-    Between pixels a picture would be drawn less sharply. A measured one that is blurred would be sought there, wherever it lies.
-    """
+    """Where beside a whole displacement (2,), px, a parabola through what whole pixels around it leave is least."""
     around = np.array([[left((step[0] + row, step[1] + column)) for column in (-1, 0, 1)] for row in (-1, 0, 1)])
     cross = 0.25 * (around[2, 2] - around[2, 0] - around[0, 2] + around[0, 0])
     curved = np.array(
@@ -356,10 +347,7 @@ def _left(
     weight: NDArray[np.float64] | float,
     away: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What a model leaves of a picture in the inner pixels, level and smooth light left free, and its level there, each (pixel,).
-
-    picture, model, inner (row, column); weight (pixel,), or one for all; away: see `_away`.
-    """
+    """What a model leaves of a picture in the inner pixels, level and smooth light left free, and its level there, each (pixel,)."""
     level = model[inner]
     weighed = weight * level
     power = float(weighed @ level) + 1e-30
@@ -375,10 +363,7 @@ def _slope(
     design: NDArray[np.float64],
     weight: NDArray[np.float64] | float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Normal matrix (2, 2) and right side (2,) of the step that leaves least, the level left free.
-
-    residual, level: see `_left`; design: slopes of the picture (2, pixel).
-    """
+    """Normal matrix (2, 2) and right side (2,) of the step that leaves least, the level free; design: slopes (2, pixel)."""
     weighed = weight * design
     cross = weighed @ level
     normal = weighed @ design.T - np.outer(cross, cross) / (float((weight * level) @ level) + 1e-30)
@@ -386,10 +371,7 @@ def _slope(
 
 
 def _inverse(normal: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What makes of a right side a step, and the step's covariance, each (2, 2), with a prior of one pixel to either side.
-
-    Along a single edge nothing shows the displacement: a weak direction stays where it is, as uncertain as the prior has it.
-    """
+    """What makes of a right side a step, 0 along a weak direction, and its covariance, each (2, 2), with a prior of one pixel."""
     values, vectors = np.linalg.eigh(normal)
     weak = values < _WEAK * values[-1]
     inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0))

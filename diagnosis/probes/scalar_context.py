@@ -141,12 +141,7 @@ def time_templates(frames: int) -> list[tuple[str, NDArray[np.float64]]]:
 
 def afterglow_bins(frames: int) -> list[tuple[int, int]]:
     """First frame of each bin of an afterglow and the one after its last: the later, the longer."""
-    bins = []
-    for start, stop in pairwise(_AFTERGLOW_EDGES):
-        if start >= frames:
-            break
-        bins.append((start, min(stop, frames)))
-    return bins
+    return [(start, min(stop, frames)) for start, stop in pairwise(_AFTERGLOW_EDGES) if start < frames]
 
 
 def frame_profile(expected: ExpectedSeries, areas: Areas) -> NDArray[np.float64]:

@@ -137,11 +137,7 @@ def scatter_share(
 ) -> float:
     """What pixels at one distance from a straight edge differ by, noise as well: rms over the local range of the picture, no unit.
 
-    Args:
-        residual_DN: of the mean frame (row, column).
-        range_DN: of the expected picture within a pixel or so (row, column).
-        mask: pixels that are compared.
-        away_px: see `distance_px`.
+    residual_DN, range_DN, mask, away_px (row, column): of the mean frame, of the expected picture, compared pixels, `distance_px`.
     """
     near = mask & (np.abs(away_px) < _NEAR_PX)
     values, ranges = np.asarray(residual_DN[near], np.float64), np.asarray(range_DN[near], np.float64)

@@ -38,13 +38,7 @@ class SeenSeams:
 def seams_in(
     changes: Sequence[NDArray[np.floating]], weights: Sequence[float], clean: NDArray[np.bool_]
 ) -> SeenSeams | None:
-    """The seams that relative changes of flats (row, column) show, those of all together; None: there is no flat.
-
-    Args:
-        changes: measured over expected, less 1, of each flat.
-        weights: of each.
-        clean: pixels in use that do not stand out (row, column).
-    """
+    """The seams that relative changes of flats (row, column), measured over expected less 1, show together; None: no flat."""
     if not changes:
         return None
     change = np.average(np.stack([np.asarray(one, dtype=np.float64) for one in changes]), axis=0, weights=weights)
@@ -74,10 +68,7 @@ def _along(change: NDArray[np.float64], clean: NDArray[np.bool_]) -> tuple[Seams
 
 
 def _steps(change: NDArray[np.float64], clean: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
-    """Square of the step at each border that has lines enough beside it (border,), over the usual one, and of how many it is worth.
-
-    Where too few pixels beside a border are clean it is 1.
-    """
+    """Square of the step at each border (border,) over the usual one, 1 where few pixels are clean, and of how many it is worth."""
     rows = len(change) // BLOCK_PX
     stacked = (rows, BLOCK_PX, change.shape[1])
     known = clean[: rows * BLOCK_PX].reshape(stacked).sum(axis=1)

@@ -21,10 +21,6 @@ def made_of(twin: Twin, series: Sequence[Series]) -> bool:
 
     The mean frame of a series lies closer to a map that it is a part of than its own noise allows; to any other map it lies
     further away, by that map's noise as well.
-
-    Args:
-        twin: calibrated from some session.
-        series: of a session with frames of the twin's shape.
     """
     good = twin.maps.bad_pixels == 0
     sure = max(_SURE * math.sqrt(2.0 / max(int(np.count_nonzero(good)), 1)), _LEAST_SHARE)
@@ -65,10 +61,7 @@ def _mean_and_noise(item: Series, good: NDArray[np.bool_]) -> tuple[NDArray[np.f
 
 
 def _variance(image: NDArray[np.float64], good: NDArray[np.bool_]) -> float:
-    """Variance of what pixels in use have of their own, without the few that a fading ghost's outline or a hot pixel shifts.
-
-    The picture that a lag left fades from frame to frame: counted as noise, it had let another day's darks pass for those of the map.
-    """
+    """Variance of what pixels in use have of their own, without the few that a fading ghost's outline or a hot pixel shifts."""
     from scipy.stats import sigmaclip
 
     steps = np.diff(image, axis=1)[good[:, 1:] & good[:, :-1]]

@@ -89,15 +89,8 @@ def prepare_session(
 ) -> PreparedSession:
     """Check a session's labels, take out what cannot be used, and calibrate its twin where none was given.
 
-    Frames of more than LARGEST_PIXELS are binned, and a given twin with them. Where series whose
-    labels are contradicted cannot calibrate, they are left out.
-
-    Args:
-        acquisition: open file.
-        twin: calibrated elsewhere; None: the session's own series make it.
-        rng: source of randomness.
-        contradicted: labels that frames contradict, whose series are left out.
-        progress: called with the name of each stage.
+    Frames of more than LARGEST_PIXELS are binned, and a given twin with them. Where series whose labels are contradicted cannot
+    calibrate, they are left out. twin: calibrated elsewhere; contradicted: labels whose series are left out.
 
     Raises:
         InputError: nothing can be calibrated or compared; the message says what is missing and what would do.
@@ -163,10 +156,7 @@ def prepare_session(
 
 
 def _taken_in(twin: Twin, factor: int) -> tuple[str, ...]:
-    """What calibration took in that the catalogue has as an effect; factor: pixels along the side of the twin's squares.
-
-    A tail that the calibrating series leave open, its interval down to none, is none that was found.
-    """
+    """What calibration took in that the catalogue has as an effect: a tail whose interval does not go down to none."""
     spread = twin.noise.spread
     known = spread.intervals.get("tail_share")
     if spread.value.tail_share == 0.0 or (known is not None and known.low <= 0.0):
@@ -213,8 +203,7 @@ def _spectral_point(
 ) -> NDArray[np.float64] | None:
     """The twin's spectral parameters (parameter,) as the session's flats show them, each beam's later ones; None: it knows all beams.
 
-    A calibration from few beams leaves the spectrum wide, and what other beams show lies far along its nuisances: straight lines
-    from the calibrated point do not reach it, and an effect of the beam was named that made up for that.
+    What beams that did not calibrate show lies far along the spectrum's nuisances, where straight lines do not reach.
     """
     calibrating = calibrating_names(acquisition.series)
     flats = [

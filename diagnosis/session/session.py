@@ -143,12 +143,9 @@ def read_session(
 ) -> tuple[SessionSeries, ...]:
     """The series of an acquisition in order of time, each with its request to the forward model.
 
-    Args:
-        acquisition: open file.
-        calibrated_elsewhere: the twin comes from another session and no series here is marked as calibrating: all were
-            taken after calibration.
-        exposed: series of the same session that tell nothing by themselves, but left charge in the panel where their load is known.
-        ends_at_zero: names of series whose numbers go down to 0 and not below.
+    calibrated_elsewhere: the twin comes from another session, and all series that are not marked as calibrating came after it;
+    exposed: further series, of which no more is known than what they left in the panel; ends_at_zero: names of series whose numbers
+    go down to 0 and not below.
 
     Raises:
         InputError: no series that the diagnosis can use.

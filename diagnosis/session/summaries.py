@@ -98,10 +98,7 @@ _Piece = tuple[NDArray[Any], NDArray[np.float32], NDArray[np.float32], NDArray[n
 def _pieces(
     pieces: Iterable[NDArray[Any]], good: NDArray[np.bool_], pattern: NDArray[np.floating[Any]] | None, name: str
 ) -> Iterator[_Piece]:
-    """Frames as they are, in single precision, less the first one and their common factor, and steps between these.
-
-    Copies of the frame before are left out: they say nothing more.
-    """
+    """Frames, none a copy of the one before, in single precision, less the first one and their common factor, and steps of these."""
     use = good.astype(np.float32)
     n_good = int(good.sum())
     if n_good < LEAST_PIXELS:
@@ -214,12 +211,9 @@ def summarise_series(
     """Statistics of a series, from pieces (m, row, column) in time order, DN.
 
     Args:
-        pieces: frames in time order.
-        good: pixels to use (row, column).
-        labels: noise label of each pixel (row, column), -1 for none; labels count from 0.
-        pattern: how one unit of the common factor looks (row, column), mean 1 over good pixels: the signal's shape with
-            the beam on, None (1 everywhere) without.
-        name: for errors.
+        pieces, name: frames, and what errors call them.
+        good, labels: pixels to use, and their noise labels from 0, -1 for none (row, column).
+        pattern: how one unit of the common factor looks (row, column), mean 1 over good pixels; None: 1 everywhere.
 
     Raises:
         InputError: no frames, frames of another shape than `good`, or values that are not finite.

@@ -97,14 +97,8 @@ def look_at_all(
 ) -> tuple[list[SeenSeries], list[str]]:
     """First pass over the frames; and why series are left out: saturated ones, and those that are nearly all cut off at 0.
 
-    Args:
-        items: series to look at.
-        expected: by the base twin, by name.
-        good: pixels in use (row, column).
-        bits: of the ADC; None: unknown.
-        dark_at: dark (row, column) of an exposure time, ms.
-        side: of the squares of the panel's pixels that stand for pixels.
-        tell: called with the name of each stage.
+    expected: by name; good: pixels in use (row, column); bits: of the ADC, None: unknown; dark_at: dark (row, column) of an exposure
+    time, ms; side: of the squares of the panel's pixels that stand for pixels.
     """
     saturation_DN = None if bits is None else 2.0**bits - 1
     seen: list[SeenSeries] = []

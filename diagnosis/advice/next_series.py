@@ -27,6 +27,7 @@ from ...generator.frames.conditions import with_conditions
 from ...generator.frames.line_model import LineModel
 from ...generator.line.series_request import SeriesRequest
 from ...generator.line.twin import Twin
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..inference.observed import Point
 from ..model.changes import Variant
 from ..problem.assemble import build_problem
@@ -79,7 +80,7 @@ class Measurement:
     series: tuple[PlannedSeries, ...]
 
 
-_Scene = tuple[str, dict[str, NDArray[np.float64]]]  # kind, and thickness maps (row, column), mm, by material
+_Scene = tuple[str, dict[str, FloatArray]]  # kind, and thickness maps (row, column), mm, by material
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +133,7 @@ def _scenes(shape: tuple[int, int], material: str) -> dict[str, _Scene]:
     half = 0.5 * min(rows, columns)
     name, opaque_mm = _OPAQUE
 
-    def opaque(inside: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
+    def opaque(inside: BoolArray) -> dict[str, FloatArray]:
         return {name: np.where(inside, opaque_mm, 0.0)}
 
     field = (np.abs(y) < 0.84 * half) & (np.abs(x) < 0.84 * half)
@@ -390,15 +391,11 @@ def _step_s(line: _Line, request: SeriesRequest) -> float:
 
 
 def _separation(
-    problem: Problem,
-    taken: Problem | None,
-    rows: NDArray[np.intp],
-    first: Explanation,
-    second: Explanation,
+    problem: Problem, taken: Problem | None, rows: IndexArray, first: Explanation, second: Explanation
 ) -> float:
     """Standard deviations between two explanations, in the session and the `rows` taken, strengths of the wrong one refitted."""
 
-    def response(point: Point) -> NDArray[np.float64]:
+    def response(point: Point) -> FloatArray:
         own = point.curve.response(point.strength)
         if taken is None:
             return own
@@ -418,7 +415,7 @@ def _separation(
     return min(length(one, blocks, apart) for one in free)
 
 
-def _joined(problem: Problem, taken: Problem, rows: NDArray[np.intp]) -> NDArray[np.float64]:
+def _joined(problem: Problem, taken: Problem, rows: IndexArray) -> FloatArray:
     """Factors (probe, factor) of the session's probes and more: what has one name is one nuisance."""
     there = np.asarray(taken.factors[rows], dtype=np.float64)
     used = [index for index in range(there.shape[1]) if np.any(there[:, index])]

@@ -54,14 +54,8 @@ class SessionPlan(Result):
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row an effect: since, unit, strength taken, separation from none, strength from which it is seen."""
         answer = self.to_dict()
-        columns = {
-            "effect": "effects",
-            "since": "since",
-            "unit": "units",
-            "strength": "strengths",
-            "from_none": "from_none",
-            "seen_from": "seen_from",
-        }
+        columns = {"effect": "effects", "since": "since", "unit": "units", "strength": "strengths"}
+        columns |= {"from_none": "from_none", "seen_from": "seen_from"}
         count = len(answer["effects"])
         return frame([{name: answer[key][row] for name, key in columns.items()} for row in range(count)])
 

@@ -42,21 +42,17 @@ def title_of(effect: str) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hypothesis:
-    """One explanation and how probable it is.
+    """One explanation and how probable it is."""
 
-    Fields: effects (ids; empty for none; `("unknown_effect",)` for an effect outside the catalogue); probability; log_evidence;
-    strengths per effect: best value and 95 % interval (value, low, high); variants per effect; levels: of discrepancy, per effect;
-    location: probe group of an unknown effect; misfit: the family in which laws leave most, empty where they leave nothing.
-    """
-
-    effects: tuple[str, ...]
+    effects: tuple[str, ...]  # ids; empty for none; `("unknown_effect",)` for an effect outside the catalogue
     probability: float
     log_evidence: float
+    # best value and 95 % interval (value, low, high), by effect
     strengths: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
-    variants: Mapping[str, Curve] = field(default_factory=dict)
-    levels: Mapping[str, float] = field(default_factory=dict)
-    location: str = ""
-    misfit: str = ""
+    variants: Mapping[str, Curve] = field(default_factory=dict)  # by effect
+    levels: Mapping[str, float] = field(default_factory=dict)  # of discrepancy, by effect
+    location: str = ""  # probe group of an unknown effect
+    misfit: str = ""  # the family in which laws leave most; empty: they leave nothing
 
     @property
     def of_catalogue(self) -> bool:

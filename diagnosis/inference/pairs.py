@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
+from ..arrays import FloatArray, IndexArray
 from ..model.curves import Curve
 from .curve_fits import IN_FULL, CurveFit, first_looks, fit_curve, log_integral, log_mean_exp, refined
 from .discrepancy import FARTHEST_LEVEL, LEVELS, at_most_off, leak_below, leak_density, log_frequency, only
@@ -64,12 +64,9 @@ def weigh_pairs(
         return []
 
     def curves(effect: str, other: str) -> list[Curve]:
+        of_effect = [curve for curve in beside if curve.effect == effect]
         own = [fit.curve for fit in singles[effect].fits]
-        return own + [
-            curve
-            for curve in beside
-            if curve.effect == effect and curve.variant.beside is not None and curve.variant.beside.id == other
-        ]
+        return own + [one for one in of_effect if one.variant.beside is not None and one.variant.beside.id == other]
 
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
     seen: dict[tuple[str, str], tuple[float, Point, str]] = {}
@@ -91,12 +88,10 @@ def weigh_pairs(
     start = _together_exactly(observed, singles)
     if start is not None and {start[1].effect, start[2]} not in [{at.effect, other} for _, at, other in starts]:
         starts.append(start)
-    result = []
-    for fit, point, other in starts:
-        first = point.effect
-        both = {first: curves(first, other), other: curves(other, first)}
-        result.append(_settled(observed, fit, point, both, other))
-    return result
+    return [
+        _settled(observed, fit, at, {at.effect: curves(at.effect, other), other: curves(other, at.effect)}, other)
+        for fit, at, other in starts
+    ]
 
 
 def _together_exactly(observed: Observed, singles: Mapping[str, Single]) -> tuple[CurveFit, Point, str] | None:
@@ -117,9 +112,8 @@ def _together_exactly(observed: Observed, singles: Mapping[str, Single]) -> tupl
     asked, gram = inner[0, 1:], inner[1:, 1:]
     own = np.maximum(np.diag(gram), 1e-12)
     free = np.maximum(np.outer(own, own) - gram**2, 1e-9 * np.outer(own, own))
-    times = (
-        own[None, :] * asked[:, None] - gram * asked[None, :]
-    ) / free  # how many times its strength each has beside another
+    # how many times its strength each has beside another
+    times = (own[None, :] * asked[:, None] - gram * asked[None, :]) / free
     effects = np.array([fit.curve.effect for fit in fits])
     apart = (effects[:, None] != effects[None, :]) & (times > 0.0) & (times.T > 0.0)
     if not np.any(apart):
@@ -220,7 +214,7 @@ def log_odds_of_leak(observed: Observed, pair: Pair) -> tuple[str, float]:
 def log_odds_of_leak_in(
     observed: Observed,
     second: CurveFit,
-    acting: tuple[NDArray[np.intp], NDArray[np.float64]],
+    acting: tuple[IndexArray, FloatArray],
     levels: Sequence[tuple[float, float]],
     *,
     shape: CurveFit | None = None,

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
 from ...generator.effects.effect import Placement
+from ..arrays import FloatArray
 from ..model.changes import Variant
 from ..model.curves import Curve
 from .curve_fits import CurveFit
@@ -41,7 +41,7 @@ def refine(
     respond: Responder,
     whitening: Whitening,
     blocks: Blocks | None = None,
-) -> list[tuple[Variant, NDArray[np.float64]]]:
+) -> list[tuple[Variant, FloatArray]]:
     """Variants nearer to what was measured than those of the grid, with their responses (strength, probe).
 
     Hypotheses of the first weighing, curves of the grid and `observed` are whitened; blocks: of series that share local nuisances, of
@@ -56,15 +56,12 @@ def refine(
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """An effect to be refined: where it is on the grid; of a pair, what stands beside it, and where it is beside that.
+    """An effect to be refined."""
 
-    moves_more: of a pair, that it moves the probes more than the other one; leads: of the first hypothesis.
-    """
-
-    own: Point
-    beside: Point | None = None
-    moves_more: bool = False
-    leads: bool = False
+    own: Point  # where it is on the grid, beside the other of a pair
+    beside: Point | None = None  # of a pair, the other, on the grid
+    moves_more: bool = False  # of a pair, that it moves the probes more than the other
+    leads: bool = False  # of the first hypothesis
 
     @property
     def effect(self) -> str:
@@ -79,7 +76,7 @@ class _Refinement:
         self._whole = whole
         self._curves = curves
         self._closer: dict[str, CurveFit] = {}
-        self.found: list[tuple[Variant, NDArray[np.float64]]] = []
+        self.found: list[tuple[Variant, FloatArray]] = []
 
     def run(self, task: Task) -> None:
         """Refine an effect; one that is not clearly seen, or beside which the other one of its pair is not, is left as it is."""

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import FloatArray, IndexArray
 from ..model.curves import Curve
 from .nuisances import Whitening
 
@@ -17,7 +17,7 @@ from .nuisances import Whitening
 class Steady:
     """The part of a curve that is in proportion in all series of one beam and scene."""
 
-    def __init__(self, curves: Sequence[Curve], alike: NDArray[np.intp], whitening: Whitening) -> None:
+    def __init__(self, curves: Sequence[Curve], alike: IndexArray, whitening: Whitening) -> None:
         """From curves of all effects, not whitened, and a number (probe,) that probes of one beam and scene share."""
         self._whitening = whitening
         steady = [curve.responses[-1] for curve in curves if curve.variant.course == "steady"]
@@ -28,7 +28,7 @@ class Steady:
         spread = None if curve.spread is None else self._part(curve.spread.T).T
         return replace(curve, responses=self._part(curve.responses), spread=spread)
 
-    def _part(self, whitened: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _part(self, whitened: FloatArray) -> FloatArray:
         """Vectors (vector, probe), whitened, with what is not in proportion left out."""
         vectors = self._whitening.undo(whitened)
         for members, directions in self._groups:
@@ -37,14 +37,14 @@ class Steady:
         return self._whitening.apply(vectors)
 
 
-def _of_one_size(alike: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+def _of_one_size(alike: IndexArray) -> list[IndexArray]:
     """Probes (class, member) that are alike, those of as many members together; a probe that is like no other is left out."""
     order = np.argsort(alike, kind="stable")
     _, starts, counts = np.unique(alike[order], return_index=True, return_counts=True)
     return [order[starts[counts == size][:, None] + np.arange(size)] for size in np.unique(counts[counts > 1])]
 
 
-def _directions(steady: NDArray[np.float64], members: NDArray[np.intp]) -> NDArray[np.float64]:
+def _directions(steady: FloatArray, members: IndexArray) -> FloatArray:
     """Unit vectors (class, member): how steady responses (curve, probe) move probes that are alike, the strongest above all."""
     moved = np.swapaxes(steady[:, members], 0, 1)  # (class, curve, member)
     _, _, right = np.linalg.svd(moved, full_matrices=False)

@@ -28,23 +28,19 @@ _PLOTTED = 12  # hypotheses, the most probable
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cause:
-    """An effect, how probable it is, its strength and inner parameters, how far the gap shrinks with it, and what its law leaves.
-
-    strength: value, low, high, signed; level: by how much of itself its law seems to be off; series: names of those in which it
-    acts, empty: all since its onset; apart: in each scene of these by an amount of its own.
-    """
+    """An effect, how probable it is, its strength and inner parameters, how far the gap shrinks with it, and what its law leaves."""
 
     effect: str
     probability: float
-    strength: tuple[float, float, float]
+    strength: tuple[float, float, float]  # value, low, high, signed
     unit: str
     parameters: Mapping[str, float]
     since: str
     shrinks_by: tuple[float, float, float] | None
-    level: float = 0.0
+    level: float = 0.0  # by how much of itself its law seems to be off
     left: tuple["Place", ...] = ()
-    series: tuple[str, ...] = ()
-    apart: bool = False
+    series: tuple[str, ...] = ()  # names of those in which it acts; empty: all since its onset
+    apart: bool = False  # in each scene of these by an amount of its own
 
     @property
     def onset(self) -> str | tuple[str, ...]:

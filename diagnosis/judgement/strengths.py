@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.frames.conditions import with_conditions
 from ...generator.line.twin import Z95
+from ..arrays import BoolArray
 from ..inference.curve_fits import fit_curve
 from ..inference.discrepancy import USUAL_LEVEL, only
 from ..inference.inference import Hypothesis
@@ -134,13 +134,10 @@ def _output_rms(problem: Problem, hypothesis: Hypothesis, output: str) -> tuple[
         lit = [number for number in lit if abs(moved[number]) < _MOST_MOVED]
     if len(lit) < _LEAST_SERIES:
         return None
-    levels, courses, noise = [], [], []
-    for number in lit:
-        view, signal_DN = problem.views[number], signals_DN[number]
-        levels.append(_relative(view, view.residual_DN, fields[number]) - moved[number])
-        courses.append(view.summary.frame_mean_DN / signal_DN)
-        noise.append(noises[number] / signal_DN**2)
-    rms = rms_about_mean(levels, courses, noise)
+    views = problem.views
+    levels = [_relative(views[one], views[one].residual_DN, fields[one]) - moved[one] for one in lit]
+    courses = [views[one].summary.frame_mean_DN / signals_DN[one] for one in lit]
+    rms = rms_about_mean(levels, courses, [noises[one] / signals_DN[one] ** 2 for one in lit])
     return None if rms <= 0.0 else (100.0 * rms, 100.0 * rms, 100.0 * rms)
 
 
@@ -224,7 +221,7 @@ def _noise_variance(view: SeriesView) -> Map:
     return np.asarray(view.noise_DN**2 + shown / view.summary.frames, np.float32)
 
 
-def _open_field(view: SeriesView) -> NDArray[np.bool_]:
+def _open_field(view: SeriesView) -> BoolArray:
     """Compared pixels (row, column) that no object covers: behind one its thickness is as uncertain as the output drifts."""
     request = view.session.request
     if not request.thickness_mm:
@@ -237,7 +234,7 @@ def _open_field(view: SeriesView) -> NDArray[np.bool_]:
     return np.asarray(view.mask & ~binary_dilation(covered, iterations=_NEAR_PX))
 
 
-def _relative(view: SeriesView, change_DN: Map, field: NDArray[np.bool_]) -> float:
+def _relative(view: SeriesView, change_DN: Map, field: BoolArray) -> float:
     """Mean of a change over a part of the field (row, column), relative to the signal there."""
     return mean_over(change_DN, field) / mean_over(view.signal_DN, field)
 
@@ -248,7 +245,7 @@ def _noise_of_a_frame(view: SeriesView) -> float:
     return mean_over(view.noise_DN**2, view.mask) * view.summary.frames / max(pixels, 1)
 
 
-def points_on(problem: Problem, leading: Hypothesis, effects: Sequence[str], fit: NDArray[np.bool_]) -> list[Point]:
+def points_on(problem: Problem, leading: Hypothesis, effects: Sequence[str], fit: BoolArray) -> list[Point]:
     """Effects at strengths fitted on part of the probes; with two effects, one after the other, three rounds."""
     points = [leading.point(effect) for effect in effects]
     if not points:

@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
+from ..arrays import FloatArray
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2, SeriesSummary
 from .fixed_pattern import Pattern
 from .lasting import LEAST_FRAMES
@@ -136,7 +136,9 @@ class _Found:
     def shared(self, quantum_DN2: float, white_DN2: float) -> float:
         """Times that correlated neighbours raise the variance of a variance."""
         share = quantum_DN2 / max(quantum_DN2 + white_DN2, 1e-12)
-        return 1.0 + share**2 * (_squared_correlations(self.base) - 1.0)
+        table = np.asarray(self.base.noise_autocovariance, dtype=np.float64) ** 2
+        squares = float(table[0, 0] + 2.0 * table[0, 1:].sum() + 2.0 * table[1:, 0].sum() + 4.0 * table[1:, 1:].sum())
+        return 1.0 + share**2 * (squares - 1.0)
 
     def noise_by_label(self) -> None:
         """Variance, and correlation of neighbours, of each label's pixels."""
@@ -239,15 +241,10 @@ class _Found:
             self.add("position", name, "1", value, 1.0 / math.sqrt(lines), "fixed_pattern lines")
 
 
-def _log_variance_of_steps(values: NDArray[np.float64], freedom: float) -> tuple[float, float]:
+def _log_variance_of_steps(values: FloatArray, freedom: float) -> tuple[float, float]:
     """Logarithm of the variance that steps from value to value (n,) show, free of what few of them make too low; its sd."""
     from scipy.special import polygamma
 
     variance = float(np.mean(np.diff(values) ** 2)) / 2.0
     bias = float(polygamma(0, freedom / 2.0)) - math.log(freedom / 2.0)
     return math.log(max(variance, 1e-12)) - bias, math.sqrt(float(polygamma(1, freedom / 2.0)))
-
-
-def _squared_correlations(expected: ExpectedSeries) -> float:
-    table = np.asarray(expected.noise_autocovariance, dtype=np.float64) ** 2
-    return float(table[0, 0] + 2.0 * table[0, 1:].sum() + 2.0 * table[1:, 0].sum() + 4.0 * table[1:, 1:].sum())

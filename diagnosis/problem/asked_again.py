@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import AppliedEffect
+from ..arrays import BoolArray, FloatArray
 from ..model.changes import Change, Variant
 from ..model.curves import LEAST_RESPONSE, places_of
 from ..model.forward_model import strength_rows
@@ -19,21 +19,15 @@ from .surroundings import border_inflow
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AskedAgain:
-    """A session's forward model and the probes of its series.
-
-    Fields: session; series, in order of time; steps: of nuisances that lie in the twin; done (probe,): what the base's own effects
-    do, by id; factors (probe,): nuisances of the base, by name.
-    """
+    """A session's forward model and the probes of its series."""
 
     session: SessionModel
-    series: tuple[SeriesBlock, ...]
-    steps: tuple[Change, ...]
-    done: Mapping[str, NDArray[np.float64]]
-    factors: Columns
+    series: tuple[SeriesBlock, ...]  # in order of time
+    steps: tuple[Change, ...]  # of nuisances that lie in the twin
+    done: Mapping[str, FloatArray]  # (probe,): what the base's own effects do, by id
+    factors: Columns  # (probe,): nuisances of the base, by name
 
-    def respond(
-        self, variants: Sequence[Variant], wanted: NDArray[np.bool_] | None = None
-    ) -> dict[int, NDArray[np.float64]]:
+    def respond(self, variants: Sequence[Variant], wanted: BoolArray | None = None) -> dict[int, FloatArray]:
         """Responses (strength, probe) of further variants, by their place among them; failed ones are left out.
 
         Series without any of the probes that are wanted (probe,) are not asked: their probes are 0.
@@ -47,15 +41,11 @@ class AskedAgain:
         asked = [self.session.ask(change) for change in (*changes, *(model.with_found([item]) for item in there))]
         responses = np.zeros((len(asked), sum(map(len, self.series))))
         for one, place in zip(self.series, places_of(self.series), strict=True):
-            if wanted is not None and not wanted[place].any():
-                continue
-            found = enumerate(self.session.moved(one.probes.series, asked))
-            moved = {row: item for row, item in found if item is not None}
-            if moved:
-                responses[list(moved), place] = one.probes.responses(list(moved.values()))
+            if wanted is None or wanted[place].any():
+                responses[:, place] = one.probes.responses(self.session.moved(one.probes.series, asked))
         names = np.repeat([one.probes.series.name for one in self.series], [len(one) for one in self.series])
 
-        def of(variant: Variant, rows: slice) -> NDArray[np.float64]:
+        def of(variant: Variant, rows: slice) -> FloatArray:
             found = responses[rows] + self.done.get(variant.effect, 0.0)
             if variant.beside is not None:
                 found = found - responses[len(changes) + there.index(variant.beside)]
@@ -67,7 +57,7 @@ class AskedAgain:
             if not any(one.failed for one in (*asked[rows], *asked[len(changes) :]))
         }
 
-    def border_inflow(self, effect: AppliedEffect) -> NDArray[np.float64] | None:
+    def border_inflow(self, effect: AppliedEffect) -> FloatArray | None:
         """What borders may let in of an effect by chance, see `border_inflow`."""
         return border_inflow(self.session, [one.probes for one in self.series], effect)
 

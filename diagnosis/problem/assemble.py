@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...acquisition.acquisition_io import AcquisitionFile, Series
 from ...acquisition.log_images import light_of_shares
@@ -13,6 +12,7 @@ from ...errors import InputError
 from ...generator.effects import EFFECTS, AppliedEffect, effect_of
 from ...generator.frames.conditions import beam_conditions, session_conditions, with_conditions
 from ...generator.line.twin import Twin
+from ..arrays import FloatArray, IndexArray
 from ..inference.discrepancy import FARTHEST_LEVEL, USUAL_LEVEL
 from ..inference.observed import Point
 from ..inference.unknown import Families
@@ -63,7 +63,7 @@ def build_problem(
     calibrated_elsewhere: bool = False,
     exposed: Sequence[Series] = (),
     ends_at_zero: frozenset[str] = frozenset(),
-    spectral_point: NDArray[np.float64] | None = None,
+    spectral_point: FloatArray | None = None,
     side: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> Problem:
@@ -101,9 +101,11 @@ def build_problem(
     variants = with_seams(variants, measured.seams())
     tell("responses")
     changes = [model.change(variant, strength) for variant in variants for strength in variant.strengths]
-    steps = _steps_in_twin(model, spectral_steps=_NEAR_A_POINT if back else 1.0, side=side)
-    changes += steps
     had = {item.id: item for item in model.base.effects}
+    steps = twin_changes(model.base, spectral_steps=_NEAR_A_POINT if back else 1.0)
+    little = [item for item in always_a_little(side=side) if item.effect not in had]
+    steps += [replace(model.change(item, item.strengths[0]), label=item.name) for item in little]
+    changes += steps
     changes += [model.without(effect) for effect in had]
     unjudged = {}
     if only_own_noise(session):
@@ -114,7 +116,7 @@ def build_problem(
         asked=tuple(expected.ask(change, refused=unjudged.get(change.label, "")) for change in changes),
         had=had,
         variants=tuple(variants),
-        steps=steps,
+        steps=tuple(steps),
         scenes=other_scenes(expected.series),
         back=back,
         side=side,
@@ -129,14 +131,6 @@ def build_problem(
 def known_by_law(effects: Sequence[AppliedEffect]) -> tuple[AppliedEffect, ...]:
     """Effects of a twin that are part of what is expected; others are sought again, and take the place of those it has."""
     return tuple(item for item in effects if effect_of(item).variation.random not in _IN_NO_LAW)
-
-
-def _steps_in_twin(model: ForwardModel, *, spectral_steps: float, side: int) -> tuple[Change, ...]:
-    """Changes of nuisances that lie in the twin; spectral_steps: as in `twin_changes`."""
-    had = {item.id for item in model.base.effects}
-    fitted = twin_changes(model.base, spectral_steps=spectral_steps)
-    little = [item for item in always_a_little(side=side) if item.effect not in had]
-    return *fitted, *(replace(model.change(item, item.strengths[0]), label=item.name) for item in little)
 
 
 def problem_of(
@@ -233,22 +227,17 @@ def _as_light(item: SessionSeries, model: ForwardModel) -> SessionSeries:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Compared:
-    """A session and the changes that every series of it is asked with.
-
-    Fields: measured; asked: changes, those of variants' strengths first, then steps, the twin less each of its effects last; had:
-    these effects; variants; steps: of nuisances that lie in the twin; scenes: see `other_scenes`; back: prior standard
-    deviations from the base twin's spectral parameters to the calibrated ones, by name; side: of the squares of the panel's
-    pixels that stand for pixels.
-    """
+    """A session and the changes that every series of it is asked with."""
 
     measured: MeasuredSession
+    # changes, those of variants' strengths first, then steps, the twin less each of its effects last
     asked: tuple[Asked, ...]
-    had: Mapping[str, AppliedEffect]
+    had: Mapping[str, AppliedEffect]  # these effects
     variants: tuple[Variant, ...]
-    steps: tuple[Change, ...]
+    steps: tuple[Change, ...]  # of nuisances that lie in the twin
     scenes: Mapping[str, OtherScenes]
-    back: Mapping[str, float]
-    side: int
+    back: Mapping[str, float]  # prior sds from the base twin's spectral parameters to the calibrated ones, by name
+    side: int  # of the squares of the panel's pixels that stand for pixels
 
     def block(self, one: SeriesModel) -> SeriesBlock:
         """One series: its templates and projections, and what every change does to it."""
@@ -315,9 +304,7 @@ def _joined(blocks: Sequence[SeriesBlock], compared: _Compared) -> Problem:
     )
 
 
-def _as_given(
-    effect: AppliedEffect, done: NDArray[np.float64], session: SessionModel, blocks: Sequence[SeriesBlock]
-) -> Point:
+def _as_given(effect: AppliedEffect, done: FloatArray, session: SessionModel, blocks: Sequence[SeriesBlock]) -> Point:
     """An effect that the twin has, as it has it; done (probe,): what it does there."""
     inner = {name: value for name, value in effect.parameters.items() if name != "strength"}
     strength = abs(effect.parameters["strength"])
@@ -362,13 +349,13 @@ def _families(names: Sequence[ProbeName], series: Sequence[Series]) -> Families:
     )
 
 
-def _numbered(keys: Sequence[_Key]) -> tuple[NDArray[np.intp], tuple[_Key, ...]]:
+def _numbered(keys: Sequence[_Key]) -> tuple[IndexArray, tuple[_Key, ...]]:
     """Number of each key (key,), in the order in which they first occur, and the keys by number."""
     numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     return np.array([numbers[key] for key in keys], dtype=np.intp), tuple(numbers)
 
 
-def _factors(blocks: Sequence[SeriesBlock], responses: NDArray[np.float64], compared: _Compared) -> Columns:
+def _factors(blocks: Sequence[SeriesBlock], responses: FloatArray, compared: _Compared) -> Columns:
     """Responses (probe,) to nuisances by name: what calibration fitted, and what series have of their own."""
     columns: Columns = {}
     first = sum(len(variant.strengths) for variant in compared.variants)
@@ -384,10 +371,10 @@ def _factors(blocks: Sequence[SeriesBlock], responses: NDArray[np.float64], comp
 
 def _curves(
     blocks: Sequence[SeriesBlock],
-    responses: NDArray[np.float64],
+    responses: FloatArray,
     names: Sequence[ProbeName],
     compared: _Compared,
-    done: Mapping[str, NDArray[np.float64]],
+    done: Mapping[str, FloatArray],
 ) -> tuple[list[Curve], dict[str, str]]:
     """Curves, and why each effect without one cannot be judged; done (probe,): by the base's own effects."""
     probes = [block.probes for block in blocks]

@@ -3,15 +3,15 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import BoolArray
 from ..model.changes import LINE_NOISE_LIMIT
 from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
 from ..session.usable import SeenSeries
 
 
 def usual_line_noise(
-    seen: Sequence[SeenSeries], summaries: Mapping[str, SeriesSummary], clean: NDArray[np.bool_]
+    seen: Sequence[SeenSeries], summaries: Mapping[str, SeriesSummary], clean: BoolArray
 ) -> tuple[float, float]:
     """Variance (DN^2) of the rows' and of the columns' offsets in one exposure, from darks, at most what no effect is.
 

@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...checks.readings import Explained
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.effects.effect import OF_FRAMES
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.twin import Twin
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..inference.observed import Point
 from ..inference.seen import Blocks
 from ..inference.unknown import Families
@@ -30,36 +30,26 @@ _WITHOUT_SCENE = 0.07  # time that a series without a scene takes, over that of 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
-    """Everything that inference needs; probes are standardised.
+    """Everything that inference needs; probes are standardised."""
 
-    Fields: residual (probe,); factors (probe, nuisance) and factor_names; curves; names (one ProbeName a probe);
-    series_of (probe,) index into views; sd (probe,) of scalar probes in their unit, 1 for map probes; noise (probe,): counting
-    noise's share of each probe's standard deviation; blocks (probe,):
-    series that share local nuisances; groups (probe,): within which an effect's law is off by one factor; families: in which an
-    unknown effect may show; views; session: the forward model of its series; skipped: what could not be used and why;
-    missing_effects: effects that cannot be judged here and why; again asks the forward model once more; side of the squares of the
-    panel's pixels that stand for pixels; given: the effects of the base, which are taken off the residual: what they do, at their
-    strengths.
-    """
-
-    residual: NDArray[np.float64]
-    factors: NDArray[np.float64]
+    residual: FloatArray  # (probe,)
+    factors: FloatArray  # (probe, nuisance)
     factor_names: tuple[str, ...]
     curves: tuple[Curve, ...]
-    names: tuple[ProbeName, ...]
-    series_of: NDArray[np.intp]
-    sd: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    groups: NDArray[np.intp]
-    families: Families
-    blocks: NDArray[np.intp]
+    names: tuple[ProbeName, ...]  # one a probe
+    series_of: IndexArray  # (probe,): index into views
+    sd: FloatArray  # (probe,): of scalar probes in their unit, 1 for map probes
+    noise: FloatArray  # (probe,): counting noise's share of each probe's standard deviation
+    groups: IndexArray  # (probe,): within which an effect's law is off by one factor
+    families: Families  # in which an unknown effect may show
+    blocks: IndexArray  # (probe,): series that share local nuisances
     views: tuple[SeriesView, ...]
-    session: SessionModel
-    skipped: tuple[str, ...]
-    missing_effects: dict[str, str]
-    again: AskedAgain | None
-    side: int = 1
-    given: tuple[Point, ...] = ()
+    session: SessionModel  # the forward model of its series
+    skipped: tuple[str, ...]  # what could not be used and why
+    missing_effects: dict[str, str]  # that cannot be judged here, and why
+    again: AskedAgain | None  # asks the forward model once more; None: released
+    side: int = 1  # of the squares of the panel's pixels that stand for pixels
+    given: tuple[Point, ...] = ()  # the effects of the base, taken off the residual, at their strengths
 
     @property
     def base(self) -> Twin:
@@ -93,7 +83,7 @@ class Problem:
         )
         return self if own is None else replace(self, curves=(*self.curves, own))
 
-    def residual_without(self, effects: Sequence[str]) -> NDArray[np.float64]:
+    def residual_without(self, effects: Sequence[str]) -> FloatArray:
         """The residual (probe,) of the base less those of its own effects that are among these."""
         left = self.residual.copy()
         for point in self.given:
@@ -101,7 +91,7 @@ class Problem:
                 left += point.curve.response(point.strength)
         return left
 
-    def left_by(self, points: Sequence[Point], *, without: Sequence[str] = ()) -> NDArray[np.float64]:
+    def left_by(self, points: Sequence[Point], *, without: Sequence[str] = ()) -> FloatArray:
         """What effects at their strengths leave of the residual (probe,).
 
         They take the place of the base's own; of these, those in `without` are not there either.
@@ -111,7 +101,7 @@ class Problem:
             left -= point.curve.response(point.strength)
         return left
 
-    def with_chance(self, points: Sequence[Point]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def with_chance(self, points: Sequence[Point]) -> tuple[FloatArray, FloatArray]:
         """Factors (probe, factor) of nuisances and of what effects do by chance; variance (probe,) of each probe by itself."""
         factors = np.concatenate([self.factors, *(point.strength * point.curve.chance for point in points)], axis=1)
         variance = np.ones(len(self.residual))
@@ -121,22 +111,22 @@ class Problem:
         return factors, variance
 
     @property
-    def places(self) -> NDArray[np.intp]:
+    def places(self) -> IndexArray:
         """Place of each probe (probe,): one axis of one series, or what one effect alone can make there."""
         return self._numbered([name.axis for name in self.names])
 
     @property
-    def left_apart(self) -> NDArray[np.intp]:
+    def left_apart(self) -> IndexArray:
         """Series of each probe (probe,), what one effect alone can make apart: a law leaves nothing where it moves nothing."""
         return self._numbered(["" for _ in self.names])
 
     @property
-    def aspects(self) -> NDArray[np.intp]:
+    def aspects(self) -> IndexArray:
         """The same (probe,), with what a series' mean frame shows and each kind of what its frames differ by apart."""
         return self._numbered([name.axis if name.axis in OF_FRAMES else "mean frame" for name in self.names])
 
     @property
-    def alike(self) -> NDArray[np.intp]:
+    def alike(self) -> IndexArray:
         """Number (probe,) that a probe of the mean frame has in all series of one beam, scene and geometry, calibrating or not."""
         keys = []
         for number, (view, name) in enumerate(zip(self.series_of, self.names, strict=True)):
@@ -148,7 +138,7 @@ class Problem:
         _, found = np.unique(keys, return_inverse=True)
         return np.asarray(found, dtype=np.intp)
 
-    def _numbered(self, kinds: Sequence[str]) -> NDArray[np.intp]:
+    def _numbered(self, kinds: Sequence[str]) -> IndexArray:
         exact = read_exactly()
         own = [
             name.statistic if name.statistic in exact else kind for name, kind in zip(self.names, kinds, strict=True)
@@ -183,9 +173,7 @@ class Problem:
         model = replace(self.session.model, cache=draft_cache())
         return replace(self, again=None, session=replace(self.session, model=model))
 
-    def respond(
-        self, variants: Sequence[Variant], /, wanted: NDArray[np.bool_] | None = None
-    ) -> Mapping[int, NDArray[np.float64]]:
+    def respond(self, variants: Sequence[Variant], /, wanted: BoolArray | None = None) -> Mapping[int, FloatArray]:
         """Responses (strength, probe) of further variants, see `AskedAgain.respond`."""
         return self._open.respond(variants, wanted)
 
@@ -200,7 +188,7 @@ class Problem:
             raise RuntimeError("asked of a problem whose projections were released")
         return self.again
 
-    def with_variants(self, more: Sequence[tuple[Variant, NDArray[np.float64]]]) -> "Problem":
+    def with_variants(self, more: Sequence[tuple[Variant, FloatArray]]) -> "Problem":
         """With further variants and their responses (strength, probe)."""
         curves = []
         for variant, responses in more:

@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.line_state import FixedPattern, TilePattern, between_lines
+from ..arrays import BoolArray, FloatArray, RealArray
 from ..model import changes as scales
 from ..model.changes import Variant
 from ..model.curves import places_of
@@ -42,36 +42,28 @@ class SeriesView:
     signal_DN: Map
     residual_DN: Map
     noise_DN: Map
-    mask: NDArray[np.bool_]
+    mask: BoolArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeriesBlock:
-    """The part of a problem that one series makes; its probes are standardised.
-
-    Fields: view; probes; signal_DN (row, column): expected, corrected; scenes: what may stand in its scene's place; residual
-    (probe,); nuisances (probe,) by name; responses (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN
-    more in every pixel; brighter (probe,): of 1 % more light; pattern (probe, wave), pattern_jitter (probe,) by what the rest of it
-    is: what 1 % of a changed gain map does by chance; lines (2, probe): variance of what 1 DN of noise common to rows (to columns)
-    does; lit_lines, alike, of 1 % of the light; uneven (2, probe) by number of change: more of it on one side of the panel; tiles
-    (probe, tile), alike: what 1 % of changed gains of its tiles does by chance.
-    """
+    """The part of a problem that one series makes; its probes are standardised."""
 
     view: SeriesView
     probes: SeriesProbes
-    signal_DN: NDArray[np.floating]
-    scenes: OtherScenes
-    residual: NDArray[np.float64]
-    nuisances: Columns
-    responses: NDArray[np.float64]
-    offset: NDArray[np.float64]
-    brighter: NDArray[np.float64]
-    pattern: NDArray[np.float64]
-    pattern_jitter: dict[FixedPattern, NDArray[np.float64]]
-    lines: NDArray[np.float64]
-    lit_lines: NDArray[np.float64]
-    uneven: dict[int, NDArray[np.float64]]
-    tiles: dict[int, NDArray[np.float64]]
+    signal_DN: RealArray  # (row, column): expected, corrected
+    scenes: OtherScenes  # what may stand in its scene's place
+    residual: FloatArray  # (probe,)
+    nuisances: Columns  # (probe,), by name
+    responses: FloatArray  # (change, probe), 0 where a change cannot be asked
+    offset: FloatArray  # (probe,): of one DN more in every pixel
+    brighter: FloatArray  # (probe,): of 1 % more light
+    pattern: FloatArray  # (probe, wave): what 1 % of a changed gain map does by chance, its smooth part
+    pattern_jitter: dict[FixedPattern, FloatArray]  # (probe,): variance of the rest, by what that is
+    lines: FloatArray  # (2, probe): variance of what 1 DN of noise common to rows (to columns) does
+    lit_lines: FloatArray  # (2, probe): the same of 1 % of the light
+    uneven: dict[int, FloatArray]  # (2, probe), by number of change: more of it on one side of the panel
+    tiles: dict[int, FloatArray]  # (probe, tile), alike: what 1 % of changed gains of its tiles does by chance
 
     def __len__(self) -> int:
         return len(self.residual)
@@ -94,23 +86,17 @@ def series_block(
 ) -> SeriesBlock:
     """One series in numbers; moved: what each change that was asked does to it; nuisances: responses (probe,) by name."""
     signal, shrink = frame.signal_DN, probes.shrink
-    responses = np.zeros((len(asked), len(probes)))
-    known = [(number, found) for number, found in enumerate(moved) if found is not None]
-    if known:
-        responses[[number for number, _ in known]] = probes.responses([found for _, found in known])
-    patterns = dict.fromkeys(
-        _pattern_of(_values_of(item)) for item in asked if _random_of(item.change.label) == "pixels"
-    )
+    # what is random of a change; nothing of a nuisance
+    labels = [item.change.label for item in asked]
+    random = [EFFECTS[label].variation.random if label in EFFECTS else "" for label in labels]
+    patterns = dict.fromkeys(_pattern_of(_values_of(asked[at])) for at, kind in enumerate(random) if kind == "pixels")
     pattern, jitter = changed_gain_pattern(probes, signal, patterns)
-    by_side = uneven(
-        probes,
-        {number: found[0] for number, found in known if _random_of(asked[number].change.label) == "sides"},
-        signal.shape,
-    )
+    sides = {at: found[0] for at, found in enumerate(moved) if found is not None and random[at] == "sides"}
+    by_side = uneven(probes, sides, signal.shape)
     tiles = {
-        number: changed_tiles(probes, signal, one) * shrink[:, None]
+        number: changed_tiles(probes, signal, TilePattern.of(_values_of(item), rms=0.01)) * shrink[:, None]
         for number, item in enumerate(asked)
-        if not item.failed and (one := _tiles_of(item)) is not None
+        if random[number] == "tiles" and not item.failed
     }
     lines, context = noise_of_lines(probes) * shrink**2, probes.series.context
     return SeriesBlock(
@@ -128,7 +114,7 @@ def series_block(
         scenes=scenes,
         residual=probes.residual(frame.residual_DN),
         nuisances=nuisances,
-        responses=responses,
+        responses=probes.responses(moved),
         offset=offset_of_later(probes) * shrink,
         brighter=brighter(probes, signal) * shrink,
         pattern=pattern * shrink[:, None],
@@ -138,13 +124,6 @@ def series_block(
         uneven={number: columns * shrink for number, columns in by_side.items()},
         tiles=tiles,
     )
-
-
-def _tiles_of(asked: Asked) -> TilePattern | None:
-    """Tiles whose gains a change draws; None: it has nothing to do with tiles."""
-    if _random_of(asked.change.label) != "tiles":
-        return None
-    return TilePattern.of(_values_of(asked), rms=0.01)
 
 
 def _pattern_of(values: Mapping[str, float]) -> FixedPattern:
@@ -158,14 +137,7 @@ def _values_of(asked: Asked) -> dict[str, float]:
     return dict(EFFECTS[effect.id].values(effect.parameters))
 
 
-def _random_of(label: str) -> str:
-    """What is random of a change; nothing of a nuisance."""
-    return EFFECTS[label].variation.random if label in EFFECTS else ""
-
-
-def by_chance(
-    variant: Variant, blocks: Sequence[SeriesBlock], row: int, readout_ms: float | None
-) -> NDArray[np.float64] | None:
+def by_chance(variant: Variant, blocks: Sequence[SeriesBlock], row: int, readout_ms: float | None) -> FloatArray | None:
     """Random responses (probe, factor) a unit of strength; None: the effect does nothing by chance.
 
     A drifting output moves each lit series' level and trend by chance; a dark's drift or a heel may be uneven over the panel;
@@ -188,7 +160,7 @@ def by_chance(
     return _of_output(variant, blocks, readout_ms) if random == "output" else None
 
 
-def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: float) -> NDArray[np.float64] | None:
+def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: float) -> FloatArray | None:
     """Variance (probe,) a unit of strength squared that an effect gives each probe by itself; None: none.
 
     A gain map changes from pixel to pixel or from column to column; lines of a few frames differ by chance in their means.
@@ -213,7 +185,7 @@ def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: fl
     )
 
 
-def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: float | None) -> NDArray[np.float64] | None:
+def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: float | None) -> FloatArray | None:
     """What a wandering output does by chance (probe, factor): levels of lit series together, trend and common factor of each."""
     size = sum(map(len, blocks))
     lit = [

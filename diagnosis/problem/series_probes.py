@@ -4,10 +4,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
 from ...generator.line.rounding import variance_kept_by_means
+from ..arrays import BoolArray, FloatArray, RealArray
 from ..model import changes as scales
 from ..model.calibrated_maps import CalibratedMaps
 from ..model.changes import Variant
@@ -28,34 +28,25 @@ from ..session.summaries import LEAST_NOISE_DN2, ROUNDED_SHARE, SeriesSummary
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeanFrame:
-    """A series' corrected mean frame against the model; maps (row, column).
+    """A series' corrected mean frame against the model; maps (row, column)."""
 
-    Fields: signal_DN: expected; residual_DN: measured less expected; mask: pixels that are compared; quantum_DN2, white_DN2: variance
-    of the mean frame, dark's and gain map's share included, correlated as quanta are, and white; rendered: share of the local range
-    to which pixels that an edge cuts are drawn.
-    """
-
-    signal_DN: NDArray[np.float64]
-    residual_DN: NDArray[np.float64]
-    mask: NDArray[np.bool_]
-    quantum_DN2: NDArray[np.float64]
-    white_DN2: NDArray[np.float64]
-    rendered: float
+    signal_DN: FloatArray  # expected
+    residual_DN: FloatArray  # measured less expected
+    mask: BoolArray  # pixels that are compared
+    quantum_DN2: FloatArray  # variance, dark's and gain map's share included, correlated as quanta are
+    white_DN2: FloatArray  # the same, white
+    rendered: float  # share of the local range to which pixels that an edge cuts are drawn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeriesProbes:
-    """The probes of one series: projections of its mean frame, then scalars.
-
-    Fields: series; projection; scalars: measured; shrink (probe,): what each number is multiplied with to have unit noise again once
-    the floor of what edges show is added; rendered: see `MeanFrame`.
-    """
+    """The probes of one series: projections of its mean frame, then scalars."""
 
     series: SeriesModel
     projection: MapProjection
-    scalars: tuple[Scalar, ...]
-    shrink: NDArray[np.float64]
-    rendered: float
+    scalars: tuple[Scalar, ...]  # measured
+    shrink: FloatArray  # (probe,): factor that gives unit noise again once noise of lines that is no effect is added
+    rendered: float  # see `MeanFrame`
 
     def __len__(self) -> int:
         return len(self.shrink)
@@ -67,64 +58,62 @@ class SeriesProbes:
         return [*self.projection.names, *scalars]
 
     @property
-    def sd(self) -> NDArray[np.float64]:
+    def sd(self) -> FloatArray:
         """Standard deviation (probe,) of scalar probes in their unit; 1 for map probes."""
         return np.concatenate([np.ones(len(self.projection)), [probe.sd for probe in self.scalars]])
 
     @property
-    def noise(self) -> NDArray[np.float64]:
+    def noise(self) -> FloatArray:
         """Counting noise's share (probe,) of each probe's standard deviation."""
         shares = [probe.sampling_sd / probe.sd for probe in self.scalars]
         return np.concatenate([np.ones(len(self.projection)), shares]) * self.shrink
 
-    def residual(self, residual_DN: NDArray[np.float64]) -> NDArray[np.float64]:
+    def residual(self, residual_DN: FloatArray) -> FloatArray:
         """Measured less expected (probe,), standardised; residual_DN: of the mean frame (row, column)."""
         expected = self.series.scalars
         scalars = np.array([(probe.value - expected[probe.name]) / probe.sd for probe in self.scalars])
         return np.concatenate([self.projection.apply(residual_DN), scalars]) * self.shrink
 
-    def responses(self, moved: Sequence[Moved]) -> NDArray[np.float64]:
-        """Responses (change, probe), standardised, to changes of the mean frame and of the scalars."""
-        expected = self.series.scalars
-        maps = self.projection.apply_each([image for image, _ in moved])
-        scalars = [
-            [(values.get(probe.name, expected[probe.name]) - expected[probe.name]) / probe.sd for probe in self.scalars]
-            for _, values in moved
-        ]
-        return np.asarray(np.concatenate([maps, scalars], axis=1) * self.shrink)
+    def responses(self, moved: Sequence[Moved | None]) -> FloatArray:
+        """Responses (change, probe), standardised, to changes of mean frame and scalars; 0 where one cannot be asked."""
+        result = np.zeros((len(moved), len(self)))
+        known = {number: found for number, found in enumerate(moved) if found is not None}
+        if known:
+            expected = self.series.scalars
+            maps = self.projection.apply_each([image for image, _ in known.values()])
+            scalars = [
+                [(values.get(one.name, expected[one.name]) - expected[one.name]) / one.sd for one in self.scalars]
+                for _, values in known.values()
+            ]
+            result[list(known)] = np.concatenate([maps, scalars], axis=1) * self.shrink
+        return result
 
-    def of_maps(self, images_DN: NDArray[np.floating]) -> NDArray[np.float64]:
+    def of_maps(self, images_DN: RealArray) -> FloatArray:
         """Responses (image, probe), not shrunk, to changes of the mean frame alone (image, row, column)."""
         return self.without_scalars(self.projection.apply(images_DN))
 
-    def without_scalars(self, projected: NDArray[np.float64]) -> NDArray[np.float64]:
+    def without_scalars(self, projected: FloatArray) -> FloatArray:
         """Responses (image, probe) of which the map probes' are given (image, map probe) and the scalars' are 0."""
         return np.pad(projected, ((0, 0), (0, len(self.scalars))))
 
-    def of_scalars(self, change: Callable[[Scalar], float]) -> NDArray[np.float64]:
+    def of_scalars(self, change: Callable[[Scalar], float]) -> FloatArray:
         """Response (probe,), not shrunk, to changes of the scalars alone, each in its unit."""
         return np.concatenate([np.zeros(len(self.projection)), [change(probe) / probe.sd for probe in self.scalars]])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredSession:
-    """What the frames of a session show, and what the base twin expects of them.
-
-    Fields: expected; pictures (row, column): corrected mean frames, DN, by name of series; summaries of the frames' noise, by name;
-    memory: of outlying pixels in darks, see `memory_of`, by name; copies: of frames, by name of the series that counts them; clean:
-    pixels in use that do not stand out (row, column); lasting (row, column): pixels whose level lasts in a later dark; outliers: how
-    many others stand out in any series; skipped: what could not be used and why.
-    """
+    """What the frames of a session show, and what the base twin expects of them."""
 
     expected: SessionModel
-    pictures: Mapping[str, NDArray[np.float64]]
-    summaries: Mapping[str, SeriesSummary]
-    memory: Mapping[str, tuple[float, int] | None]
-    copies: Mapping[str, int]
-    clean: NDArray[np.bool_]
-    lasting: NDArray[np.bool_]
-    outliers: int
-    skipped: tuple[str, ...]
+    pictures: Mapping[str, FloatArray]  # (row, column): corrected mean frames, DN, by name of series
+    summaries: Mapping[str, SeriesSummary]  # of the frames' noise, by name
+    memory: Mapping[str, tuple[float, int] | None]  # of outlying pixels in darks, see `memory_of`, by name
+    copies: Mapping[str, int]  # of frames, by name of the series that counts them
+    clean: BoolArray  # (row, column): pixels in use that do not stand out
+    lasting: BoolArray  # (row, column): pixels whose level lasts in a later dark
+    outliers: int  # how many others stand out in any series
+    skipped: tuple[str, ...]  # what could not be used and why
 
     def seams(self) -> SeenSeams | None:
         """Where flats that came after calibration show that tiles meet; None: there is none."""
@@ -139,12 +128,7 @@ class MeasuredSession:
 
 
 def mean_frame(
-    one: SeriesModel,
-    corrected_DN: NDArray[np.float64],
-    maps: CalibratedMaps,
-    *,
-    frames: int,
-    side: int,
+    one: SeriesModel, corrected_DN: FloatArray, maps: CalibratedMaps, *, frames: int, side: int
 ) -> MeanFrame:
     """A series' corrected mean frame (row, column) against the model.
 
@@ -182,9 +166,7 @@ def mean_frame(
     )
 
 
-def _rendered(
-    one: SeriesModel, residual_DN: NDArray[np.float64], signal_DN: NDArray[np.float64], mask: NDArray[np.bool_]
-) -> float:
+def _rendered(one: SeriesModel, residual_DN: FloatArray, signal_DN: FloatArray, mask: BoolArray) -> float:
     """Share of the local range to which pixels at edges are drawn: of a straight edge as it is seen, of others as assumed."""
     request = one.session.request
     if request.scene_kind != "edge" or request.thickness_mm is None:
@@ -195,9 +177,7 @@ def _rendered(
     return min(RENDER_SHARE, scatter_share(residual_DN, local_range(signal_DN), mask, away))
 
 
-def variance_of_what_came(
-    variance_DN2: NDArray[np.float64], signal_DN: NDArray[np.float64], corrected_DN: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def variance_of_what_came(variance_DN2: FloatArray, signal_DN: FloatArray, corrected_DN: FloatArray) -> FloatArray:
     """Variance (row, column), DN^2, that the light which is there gives a frame, by the mean ratio of variance to signal.
 
     Without noise of the detector's own, a deep shadow has none by the model, and light that strays there the evidence of thousands.
@@ -269,7 +249,7 @@ def series_probes(
     )
 
 
-def _standing_still(summary: SeriesSummary) -> NDArray[np.bool_]:
+def _standing_still(summary: SeriesSummary) -> BoolArray:
     """Pixels (row, column) whose noise hardly reaches over a step of the ADC, by what their neighbours do as well."""
     from scipy.ndimage import uniform_filter
 

@@ -3,17 +3,15 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS, AppliedEffect
+from ..arrays import FloatArray
 from ..model import changes as scales
 from ..model.responses import SessionModel
 from .series_probes import SeriesProbes
 
 
-def border_inflow(
-    session: SessionModel, series: Sequence[SeriesProbes], effect: AppliedEffect
-) -> NDArray[np.float64] | None:
+def border_inflow(session: SessionModel, series: Sequence[SeriesProbes], effect: AppliedEffect) -> FloatArray | None:
     """What an effect may let in by chance (probe, placement of a scene), a unit of its strength; None: it brings nothing in.
 
     That is what comes in if the picture goes on as it ends, less what comes in if it mirrors. An edge that crosses a border and runs
@@ -31,7 +29,7 @@ def border_inflow(
     )
 
 
-def _of_series(session: SessionModel, probes: SeriesProbes, effect: AppliedEffect) -> NDArray[np.float64]:
+def _of_series(session: SessionModel, probes: SeriesProbes, effect: AppliedEffect) -> FloatArray:
     """The same of one series (probe,)."""
     if probes.series.session.series.kind != "object":
         return np.zeros(len(probes))

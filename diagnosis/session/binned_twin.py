@@ -8,12 +8,12 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...acquisition.binned_frames import means_of_bins
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.line.twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, Twin, gaussian_spread
 from ...generator.spread.psf import Spread, blur_variance_share
+from ..arrays import FloatArray
 
 _MODEL = "sampled"
 _WIDEST = 8.0  # bins that light may spread over
@@ -110,7 +110,7 @@ def _spectral(spectral: SpectralPosterior, factor: int, *, pitch_known: bool) ->
     more = 2.0 * math.log(factor)
     moved = {"log_DN_per_keV": -more} | ({} if pitch_known else {"log_output": more})
 
-    def per_bin(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def per_bin(values: FloatArray) -> FloatArray:
         return np.asarray(values + np.array([moved.get(name, 0.0) for name in spectral.names]))
 
     return replace(spectral, samples=per_bin(spectral.samples), best=per_bin(spectral.best))

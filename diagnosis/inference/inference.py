@@ -95,11 +95,9 @@ def weigh_hypotheses(
     the twin.
 
     Args:
-        seen: standardised probes less the twin's with what may vary, and the fits of each effect's curves to it; several curves of
-            one effect are variants with equal prior. Several of these for several levels by which laws of the twin's own effects may
-            be off, over which the evidence is averaged.
+        seen: what is weighed, and the fits of each effect's curves, variants with equal prior, to it; several of these for several
+            levels by which laws of the twin's own effects may be off, over which the evidence is averaged.
         families: of probes, in which an unknown effect may show.
-        priors: of the kinds of hypothesis.
         of_catalogue: number of effects that share the priors, those that cannot show here among them; at least those with fits.
         misfits: laws may leave a misfit; False: they may not, a first look at a third of the cost.
         beside: curves of effects as they respond beside another.

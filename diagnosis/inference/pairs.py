@@ -221,13 +221,9 @@ def log_odds_of_leak_in(
 ) -> float:
     """How much likelier it is that a law leaves an effect's shape than that the effect is there: log of it.
 
-    Args:
-        observed: what is weighed.
-        second: the effect's fit beside that law.
-        acting: parts of the session (probe,), in each of which the law leaves its own share, and how far it moves the probes of each,
-            squared standard deviations (part,).
-        levels: by which it is off, each after its probability.
-        shape: the fit of what such a law could leave of the effect's shape; None: all of it.
+    second: the effect's fit beside that law; acting: parts of the session (probe,), in each of which the law leaves a share, and
+    how far it moves each, squared standard deviations (part,); levels: by which it is off, each after its probability; shape: the fit
+    of what such a law could leave of the effect's shape, None: all of it.
     """
     shape = second if shape is None else shape
     parts, squares = acting
@@ -251,13 +247,7 @@ def log_prior(observed: Observed, point: Point, *, another: bool = False, any_st
 
     Strengths are even in their logarithm. The Gaussian that `Observed.in_presence_of` frees them by is no prior: what it gives is
     subtracted, and the integral over the reach put in its place. About a point, where the likelihood is highest, that falls to both
-    sides, but at an end of the reach.
-
-    Args:
-        observed: what all other effects leave, without this one.
-        point: with strengths as free as it says.
-        another: the effect is only like the curve's.
-        any_strength: that the curve is tried at, none more plausible than another.
+    sides, but at an end of the reach. observed: without this effect; any_strength: none that is tried is more plausible.
     """
     curve, variant = point.curve, point.curve.variant
     slope, curvature = observed.score_and_information(point)

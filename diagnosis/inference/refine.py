@@ -204,10 +204,7 @@ def tasks_of(hypotheses: Sequence[Hypothesis]) -> list[Task]:
 
 def _within_reach(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """The best known effect or pair, and those that refinement could bring past it, best first; none where no effect helps."""
-    known = sorted(
-        (item for item in hypotheses if item.of_catalogue),
-        key=lambda item: -item.log_evidence,
-    )
+    known = sorted((item for item in hypotheses if item.of_catalogue), key=lambda item: -item.log_evidence)
     # refinement adds some fifth to the evidence of the best on the grid, and far more is needed to be named
     if not known or known[0].log_evidence < ENOUGH:
         return []

@@ -120,11 +120,8 @@ class Variant:
 
     def applied(self, strength: float) -> AppliedEffect:
         """The effect at a strength, as the forward model takes it."""
-        return AppliedEffect(
-            id=self.effect,
-            parameters={**self.parameters, "strength": self.sign * strength},
-            since=self.since,
-        )
+        parameters = {**self.parameters, "strength": self.sign * strength}
+        return AppliedEffect(id=self.effect, parameters=parameters, since=self.since)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

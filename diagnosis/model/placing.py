@@ -215,14 +215,7 @@ def displacement_probes(placement: Placement, *, between_points: bool) -> list[S
     """
     stated_px = math.hypot(scales.POSITION_SD_PX, ANYWHERE_SD_PX if between_points else 0.0)
     return [
-        Scalar(
-            axis="sharpness",
-            name=name,
-            unit="px",
-            value=value,
-            sd=math.hypot(sd, stated_px),
-            sampling_sd=sd,
-        )
+        Scalar(axis="sharpness", name=name, unit="px", value=value, sd=math.hypot(sd, stated_px), sampling_sd=sd)
         for name, value, sd in (
             (ALONG_ROWS, placement.row_px, placement.row_sd_px),
             (ALONG_COLUMNS, placement.column_px, placement.column_sd_px),

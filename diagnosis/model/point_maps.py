@@ -43,13 +43,8 @@ def sampled_at_points(thickness_mm: Mapping[str, RealArray] | None) -> bool:
 def blurred_between_points(thickness_mm: Mapping[str, RealArray], signal: FloatArray) -> NDArray[np.float32]:
     """What a blur of borders that run smoothly between the points adds to a blur of the jumps (image, row, column), DN.
 
-    Between the points a border is taken to run as smoothly as they allow (three smoothnesses, two blurs): its distance is
-    smoothed again and again, and kept to the side that each point says. A border along rows or columns adds nothing, and what
-    is the same all along a border is left out: that is a blur.
-
-    Args:
-        thickness_mm: maps (row, column), by material.
-        signal: expected (row, column), DN.
+    A border is taken to run as smoothly as the points allow (three smoothnesses, two blurs): its distance is smoothed, many times,
+    and kept to the side that each point says. What is the same all along a border is left out: that is a blur.
 
     Source: R. T. Whitaker, Reducing aliasing artifacts in iso-surfaces of binary volumes, IEEE Symposium on Volume
         Visualization 2000, 23-32, doi:10.1109/VV.2000.10000.

@@ -125,12 +125,8 @@ def register(
 ) -> Placement:
     """Placement of a scene from the pictures of all its series: Gauss-Newton, level and smooth light left free.
 
-    A displacement has a standard deviation of one pixel along either side before looking.
-
-    Args:
-        measured, expected: signals (row, column), DN, of each series.
-        variance: of the measured ones.
-        mask: pixels to use; the outermost three are left out.
+    A displacement has a standard deviation of one pixel along either side before looking. measured, expected: signals (row, column),
+    DN, of each series; variance: of the measured ones; mask: pixels to use, but for the outermost three.
     """
     inner = without_border(mask)
     current = np.zeros(2)

@@ -45,7 +45,11 @@ def nuisances_of_series(session: SessionModel, probes: SeriesProbes, signal: Flo
     if item.series.kind != "flat":  # against a flat's light it is nothing
         images[f"dark of {item.name}"] = np.full(signal.shape, scales.DARK_SD_DN)
     if not item.calibrates:
-        columns["few new bad pixels"] = _few_bad_pixels(probes)
+        # half of the few pixels that may turn bad without that being an effect, as counts of outliers show them
+        few = 0.5 * max(scales.FEW_BAD_PIXELS, scales.FEW_BAD_SHARE * probes.series.context.areas.order.size)
+        more = root_of_count(few) - root_of_count(0)
+        counts = (OUTLIERS, OUTLIERS_ANYWHERE)
+        columns["few new bad pixels"] = probes.of_scalars(lambda probe: more if probe.name in counts else 0.0)
     if item.series.kind == "object":
         columns |= _of_thickness(probes, signal, redrawn.thicker, beams_differ)
         images |= _of_scene(item, signal, sharp=model.sharp, rough=probes.rendered / RENDER_SHARE)
@@ -195,13 +199,6 @@ def _of_steps(probes: SeriesProbes, name: str) -> float:
     own = math.exp(probes.series.scalars[name])
     jitter = (scales.OUTPUT_STEP_LIMIT * probes.series.context.reference_signal_DN) ** 2
     return math.log1p(jitter / own)
-
-
-def _few_bad_pixels(probes: SeriesProbes) -> FloatArray:
-    """Half of the few pixels that may turn bad without that being an effect, as counts of outliers show them."""
-    few = 0.5 * max(scales.FEW_BAD_PIXELS, scales.FEW_BAD_SHARE * probes.series.context.areas.order.size)
-    more = root_of_count(few) - root_of_count(0)
-    return probes.of_scalars(lambda probe: more if probe.name in (OUTLIERS, OUTLIERS_ANYWHERE) else 0.0)
 
 
 def _of_scene(item: SessionSeries, signal: FloatArray, *, sharp: bool, rough: float) -> _Images:

@@ -204,13 +204,11 @@ class Problem:
 
 def _difference(before: ExpectedSeries, after: ExpectedSeries, *, shape: tuple[int, ...]) -> Explained:
     """What has been added to a series' mean, and by what its frames' variance was multiplied (row, column)."""
-    variances = [
+    first, last = (
         np.maximum(item.quantum_variance_DN2 + item.white_variance_DN2, LEAST_NOISE_DN2) for item in (before, after)
-    ]
-    return Explained(
-        mean_DN=full_size(after.mean_DN - before.mean_DN, shape),
-        variance=full_size(variances[1] / variances[0], shape),
     )
+    mean_DN = full_size(after.mean_DN - before.mean_DN, shape)
+    return Explained(mean_DN=mean_DN, variance=full_size(last / first, shape))
 
 
 def read_exactly() -> frozenset[str]:

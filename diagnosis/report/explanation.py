@@ -222,12 +222,7 @@ def _not_explained(diagnosis: Diagnosis) -> list[str]:
             who, where = "The other series agree with the twin", " in them"
         return [f"{who} (probability {diagnosis.probability_no_gap:.2f} that nothing is missing{where}).", figures]
     if diagnosis.verdict == "unknown_effect":
-        return [
-            *_where(diagnosis.where),
-            _unknown(diagnosis),
-            *_signature(diagnosis),
-            figures,
-        ]
+        return [*_where(diagnosis.where), _unknown(diagnosis), *_signature(diagnosis), figures]
     named = ", ".join(f"{title} ({probability:.2f})" for title, probability in rivals(diagnosis))
     measure = diagnosis.next_measurement
     return [

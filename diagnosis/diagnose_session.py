@@ -40,48 +40,37 @@ def diagnose(
     """
     # thousands of small matrices: threads would wait for each other longer than they work
     with threadpool_limits(limits=1, user_api="blas"):
-        return _diagnosed(acquisition, twin, rng, without, progress)
-
-
-def _diagnosed(
-    acquisition: AcquisitionFile,
-    twin: Twin | None,
-    rng: np.random.Generator,
-    without: Sequence[str],
-    progress: Callable[[str], None] | None,
-) -> Diagnosis:
-    """The series whose frames do not contradict their labels, or do so by what is found, and what contradicts them."""
-    wrong: tuple[Finding, ...] = ()
-    while True:
-        session = prepare_session(acquisition, twin=twin, rng=rng, contradicted=wrong, progress=progress)
-        left = session.findings
-        try:
-            problem = problem_of(session, without=(*without, *session.out_of_question), progress=progress)
-            result = judge(problem, session.twin, rng=rng, progress=progress)
-        except InputError as error:
-            if not left and session.contradicted:
-                raise mislabelled(acquisition, session.contradicted) from error
-            if not left:
-                raise
-        else:
-            if left and result.added:
-                left = findings_left(session, problem.explained_by(result.added))
-            if not left:
-                break
-        wrong = (*session.contradicted, *left)
-    cleared = (f"{item.line}; what was found makes it look so" for item in session.findings)
-    result = replace(
-        _with_findings(result, (*session.contradicted, *session.other_findings)),
-        warnings=(*session.left_out, *result.warnings),
-        notes=(*session.notes, *result.notes, *cleared),
-    )
-    if session.factor == 1:
-        return result
-    if twin is None:
-        if progress is not None:
-            progress("calibration with all pixels")
-        twin = calibrated_twin(session.all_pixels, rng=rng)
-    return in_pixels(result, twin=twin, factor=session.factor)
+        wrong: tuple[Finding, ...] = ()
+        while True:
+            session = prepare_session(acquisition, twin=twin, rng=rng, contradicted=wrong, progress=progress)
+            left = session.findings
+            try:
+                problem = problem_of(session, without=(*without, *session.out_of_question), progress=progress)
+                result = judge(problem, session.twin, rng=rng, progress=progress)
+            except InputError as error:
+                if not left and session.contradicted:
+                    raise mislabelled(acquisition, session.contradicted) from error
+                if not left:
+                    raise
+            else:
+                if left and result.added:
+                    left = findings_left(session, problem.explained_by(result.added))
+                if not left:
+                    break
+            wrong = (*session.contradicted, *left)
+        cleared = (f"{item.line}; what was found makes it look so" for item in session.findings)
+        result = replace(
+            _with_findings(result, (*session.contradicted, *session.other_findings)),
+            warnings=(*session.left_out, *result.warnings),
+            notes=(*session.notes, *result.notes, *cleared),
+        )
+        if session.factor == 1:
+            return result
+        if twin is None:
+            if progress is not None:
+                progress("calibration with all pixels")
+            twin = calibrated_twin(session.all_pixels, rng=rng)
+        return in_pixels(result, twin=twin, factor=session.factor)
 
 
 def _with_findings(diagnosis: Diagnosis, findings: tuple[Finding, ...]) -> Diagnosis:

@@ -13,6 +13,7 @@ import math
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from ...generator.frames.conditions import with_conditions
 from ...generator.frames.line_model import LineModel
 from ...generator.line.series_request import SeriesRequest
 from ...generator.line.twin import Twin
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..inference.observed import Point
 from ..model.changes import Variant
 from ..problem.assemble import build_problem
@@ -78,7 +80,7 @@ class Measurement:
     series: tuple[PlannedSeries, ...]
 
 
-_Scene = tuple[str, dict[str, NDArray[np.float64]]]  # kind, and thickness maps (row, column), mm, by material
+_Scene = tuple[str, dict[str, FloatArray]]  # kind, and thickness maps (row, column), mm, by material
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +133,7 @@ def _scenes(shape: tuple[int, int], material: str) -> dict[str, _Scene]:
     half = 0.5 * min(rows, columns)
     name, opaque_mm = _OPAQUE
 
-    def opaque(inside: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
+    def opaque(inside: BoolArray) -> dict[str, FloatArray]:
         return {name: np.where(inside, opaque_mm, 0.0)}
 
     field = (np.abs(y) < 0.84 * half) & (np.abs(x) < 0.84 * half)
@@ -169,10 +171,9 @@ def _as_bright(setting: Setting, as_: Setting, twin: Twin) -> Setting | None:
     return found
 
 
-def _exposed(setting: Setting, exposure_ms: float, *, equal_charge: bool) -> Setting:
-    """The setting at another exposure time, at its current or at its charge."""
-    factor = setting.exposure_ms / exposure_ms if equal_charge else 1.0
-    return replace(setting.with_current_times(factor), exposure_ms=exposure_ms)
+def _exposed(setting: Setting, share: float) -> Setting:
+    """The setting at a share of its exposure time."""
+    return replace(setting, exposure_ms=share * setting.exposure_ms)
 
 
 def measurements_lacking(problem: Problem) -> tuple[Measurement, ...]:
@@ -189,20 +190,12 @@ def measurements_lacking(problem: Problem) -> tuple[Measurement, ...]:
         """Distances at which the session has a sort of object."""
         return {round(item.source_object_mm or 0.0, 1) for item in requests if item.scene_kind == kind}
 
-    def shots(scene: str, distances: Sequence[float], settings: Sequence[Setting]) -> list[PlannedSeries]:
-        return [
-            PlannedSeries(
-                kind="object", setting=one, exposure_ms=one.exposure_ms, scene=scene, source_object_mm=distance
-            )
-            for distance in distances
-            for one in settings
-        ]
+    def taken(kind: str, settings: Sequence[Setting], **where: Any) -> list[PlannedSeries]:
+        return [PlannedSeries(kind=kind, setting=one, exposure_ms=one.exposure_ms, **where) for one in settings]
 
-    def flats(settings: Sequence[Setting], turned_deg: float = 0.0) -> list[PlannedSeries]:
-        return [
-            PlannedSeries(kind="flat", setting=one, exposure_ms=one.exposure_ms, panel_rotation_deg=turned_deg)
-            for one in settings
-        ]
+    def shots(scenes: Sequence[str], distances: Sequence[float], settings: Sequence[Setting]) -> list[PlannedSeries]:
+        places = product(scenes, distances)
+        return [one for scene, mm in places for one in taken("object", settings, scene=scene, source_object_mm=mm)]
 
     def far(kind: str) -> list[float]:
         """Distances that make two with those that the session has."""
@@ -210,7 +203,7 @@ def measurements_lacking(problem: Problem) -> tuple[Measurement, ...]:
         lacking = [one for one in (line.usual_mm, line.other_mm) if round(one, 1) not in known]
         return lacking[:1] if known else lacking
 
-    every = list(line.settings.values())
+    every, usual, edges = list(line.settings.values()), [line.usual_mm], ("edge x", "edge y")
     kVs = " and ".join(f"{kV:g}" for kV in voltages) + " kV"
     found: list[Measurement] = []
 
@@ -220,34 +213,31 @@ def measurements_lacking(problem: Problem) -> tuple[Measurement, ...]:
     if not any(item.kind == "afterglow" for item in requests):
         off = PlannedSeries(kind="afterglow", setting=None, exposure_ms=high.exposure_ms)
         text = f"{FRAMES} frames with the beam off straight after flats at {high.kV:g} kV"
-        add("afterglow", text, [*flats([high]), off])
+        add("afterglow", text, [*taken("flat", [high]), off])
     if sum(item.kind == "dark" and item.after_calibration for item in requests) < 2:
         dark = PlannedSeries(kind="dark", setting=None, exposure_ms=longest)
         add("darks", f"darks of {longest:g} ms between the other series", [dark, dark])
     if not held("disc"):
-        discs = [one for name in ("small disc", "large disc") for one in shots(name, [line.usual_mm], every)]
-        add("discs", f"opaque discs of two sizes at {kVs}", discs)
+        add("discs", f"opaque discs of two sizes at {kVs}", shots(("small disc", "large disc"), usual, every))
     if len(held("edge")) < 2:
-        edges = [one for name in ("edge x", "edge y") for one in shots(name, far("edge"), every)]
         places = " and ".join(f"{one:.0f} mm" for one in far("edge"))
-        add("edges", f"an opaque edge in two directions, {places} from the source, at {kVs}", edges)
-    timed = [_exposed(high, share * high.exposure_ms, equal_charge=False) for share in (1.0, 0.5, 0.25)]
+        text = f"an opaque edge in two directions, {places} from the source, at {kVs}"
+        add("edges", text, shots(edges, far("edge"), every))
     if len({item.exposure_ms for item in requests if item.scene_kind == "edge"}) < 2:
         # equal charge: that of the shortest
-        equal = [_exposed(timed[-1], one.exposure_ms, equal_charge=True) for one in timed]
+        equal = [_exposed(high.with_current_times(0.25 / share), share) for share in (1.0, 0.5, 0.25)]
         text = f"an opaque edge at {', '.join(f'{one.exposure_ms:g}' for one in equal)} ms of equal charge"
-        edges = [one for name in ("edge x", "edge y") for one in shots(name, [line.usual_mm], equal)]
-        add("timed edges", text, edges)
+        add("timed edges", text, shots(edges, usual, equal))
     if len(held("slab")) < 2:
         places = " and ".join(f"{one:.0f} mm" for one in far("slab"))
         text = f"a slab of {_SLAB_MM:g} mm {line.material}, {places} from the source"
-        add("slabs", text, shots("slab", far("slab"), every))
+        add("slabs", text, shots(["slab"], far("slab"), every))
     if not held("wedge"):
-        add("wedge", f"a wedge of known steps (PMMA, Al) at {kVs}", shots("wedge", [line.usual_mm], every))
+        add("wedge", f"a wedge of known steps (PMMA, Al) at {kVs}", shots(["wedge"], usual, every))
     others = [_as_bright(replace(high, kV=kV), high, line.twin) for kV in _other_voltages(voltages)]
     other = next((one for one in others if one is not None), None)
     if len(voltages) == 1 and other is not None:
-        more = [*flats([other]), *shots("wedge", [line.usual_mm], [other]), *shots("edge x", [line.usual_mm], [other])]
+        more = [*taken("flat", [other]), *shots(["wedge", "edge x"], usual, [other])]
         add("voltage", f"flats, a wedge of known steps and an opaque edge at {other.kV:g} kV", more)
     stacks: dict[float, set[str]] = {}
     for item in requests:
@@ -257,14 +247,12 @@ def measurements_lacking(problem: Problem) -> tuple[Measurement, ...]:
         behind = [_as_bright(replace(one, filters=(*one.filters, _FILTER)), one, line.twin) for one in every]
         filtered = [one for one in behind if one is not None]
         if filtered:
-            add("filter", f"flats behind {_FILTER} more at {kVs}", flats(filtered))
+            add("filter", f"flats behind {_FILTER} more at {kVs}", taken("flat", filtered))
     if len({item.exposure_ms for item in requests if item.kind == "flat"}) < 3:
-        levels = [
-            _exposed(one, share * one.exposure_ms, equal_charge=False) for one in every for share in _SHARES_OF_EXPOSURE
-        ]
-        add("exposures", "flats at four exposure times and one current", flats(levels))
+        levels = [_exposed(one, share) for one in every for share in _SHARES_OF_EXPOSURE]
+        add("exposures", "flats at four exposure times and one current", taken("flat", levels))
     if not any(item.panel_rotation_deg % 360.0 for item in requests):
-        add("turned", "flats with the panel turned by 180 degrees", flats(every, turned_deg=180.0))
+        add("turned", "flats with the panel turned by 180 degrees", taken("flat", every, panel_rotation_deg=180.0))
     return tuple(found)
 
 
@@ -277,13 +265,7 @@ def _other_voltages(voltages: Sequence[float]) -> list[float]:
 def best_measurement(
     problem: Problem, first: Explanation, second: Explanation, *, rng: np.random.Generator
 ) -> Proposal | None:
-    """The measurement that a session lacks and that would set two explanations furthest apart; None where none can be planned.
-
-    Args:
-        problem: of the session.
-        first, second: the explanations.
-        rng: of the frames that stand for the measurements.
-    """
+    """The measurement that a session lacks and that would set two explanations furthest apart; None where none can be planned."""
     line, planned = _line_of(problem), measurements_lacking(problem)
     if line is None or not planned:
         return None
@@ -409,21 +391,11 @@ def _step_s(line: _Line, request: SeriesRequest) -> float:
 
 
 def _separation(
-    problem: Problem,
-    taken: Problem | None,
-    rows: NDArray[np.intp],
-    first: Explanation,
-    second: Explanation,
+    problem: Problem, taken: Problem | None, rows: IndexArray, first: Explanation, second: Explanation
 ) -> float:
-    """Standard deviations between two explanations, the strengths of the one that is wrong fitted again.
+    """Standard deviations between two explanations, in the session and the `rows` taken, strengths of the wrong one refitted."""
 
-    Args:
-        problem: the session.
-        taken: what was planned; None: nothing.
-        rows: its probes that count.
-    """
-
-    def response(point: Point) -> NDArray[np.float64]:
+    def response(point: Point) -> FloatArray:
         own = point.curve.response(point.strength)
         if taken is None:
             return own
@@ -443,7 +415,7 @@ def _separation(
     return min(length(one, blocks, apart) for one in free)
 
 
-def _joined(problem: Problem, taken: Problem, rows: NDArray[np.intp]) -> NDArray[np.float64]:
+def _joined(problem: Problem, taken: Problem, rows: IndexArray) -> FloatArray:
     """Factors (probe, factor) of the session's probes and more: what has one name is one nuisance."""
     there = np.asarray(taken.factors[rows], dtype=np.float64)
     used = [index for index in range(there.shape[1]) if np.any(there[:, index])]

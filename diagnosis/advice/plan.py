@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...generator.effects import EFFECTS
+from ..arrays import FloatArray, IndexArray
 from ..inference.inference import title_of
 from ..inference.nuisances import Nuisances, Whitening
 from ..inference.observed import Point
@@ -30,20 +30,14 @@ _CANDIDATES = 4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Distinguishability:
-    """Separation of effects, standard deviations, nuisances and the other's strength and inner parameters refitted.
+    """Separation of effects, standard deviations, nuisances and the other's strength and inner parameters refitted."""
 
-    Fields: effects (effect,); since (effect,): the onset that each is taken with, its usual one where the session can show it;
-    strengths (effect,): at which each is taken, middle of its range, its inner parameters those that are seen neither best nor
-    worst; from_none (effect,); seen_from (effect,): least strength of the plausible range that lies CLEAR from none, inf: none;
-    between (effect, effect): of the row's effect from the column's at whatever strength and inner parameters come nearest.
-    """
-
-    effects: tuple[str, ...]
-    since: tuple[str, ...]
-    strengths: NDArray[np.float64]
-    from_none: NDArray[np.float64]
-    seen_from: NDArray[np.float64]
-    between: NDArray[np.float64]
+    effects: tuple[str, ...]  # (effect,)
+    since: tuple[str, ...]  # (effect,): the onset that each is taken with, its usual one where the session can show it
+    strengths: FloatArray  # (effect,): middle of the range, inner parameters those that are seen neither best nor worst
+    from_none: FloatArray  # (effect,)
+    seen_from: FloatArray  # (effect,): least strength of the plausible range that lies CLEAR from none, inf: none
+    between: FloatArray  # (effect, effect): of the row's effect from the column's at what strength and inner parameters come nearest
 
 
 def distinguishability(problem: Problem) -> Distinguishability:
@@ -61,7 +55,7 @@ def distinguishability(problem: Problem) -> Distinguishability:
     gram = Nuisances(whitening.factors).inner(nodes, nodes)
     places = places_of([curve.responses for curve in curves])
 
-    def lengths(number: int, strengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    def lengths(number: int, strengths: FloatArray) -> FloatArray:
         weights, own = curves[number].weights(strengths), gram[places[number], places[number]]
         return np.asarray(np.sqrt(np.maximum(np.einsum("si,ij,sj->s", weights, own, weights), 0.0)))
 
@@ -108,13 +102,8 @@ def _middle(curve: Curve) -> float:
     return math.sqrt(curve.variant.low * curve.variant.high)
 
 
-def _usual(
-    effect: str, curves: Sequence[Curve], lengths: Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
-) -> int:
-    """Number of the curve that stands for an effect: of its usual onset, if there is one, and of those the middle one in length.
-
-    lengths: of a curve (number) at strengths (strength,), standard deviations.
-    """
+def _usual(effect: str, curves: Sequence[Curve], lengths: Callable[[int, FloatArray], FloatArray]) -> int:
+    """Number of the curve that stands for an effect: of its usual onset, if there is one, and of those the middle one in length."""
     own = [number for number, curve in enumerate(curves) if curve.effect == effect]
     onset = EFFECTS[effect].usual_onset
     usual = [number for number in own if curves[number].variant.since == onset] or own
@@ -124,18 +113,14 @@ def _usual(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proposal:
-    """What to measure to distinguish two explanations, in words, and their separation: as the session is, and with it.
+    """What to measure to distinguish two explanations, and their separation, standard deviations."""
 
-    Fields: what; separation, separation_then: standard deviations; series: name of the one of the session that is taken again, else
-    empty; measured: new series, as an acquisition's attributes, else none; name: of what is measured new.
-    """
-
-    what: str
-    separation: float
-    separation_then: float
-    series: str = ""
-    measured: tuple[Mapping[str, Any], ...] = ()
-    name: str = ""
+    what: str  # in words
+    separation: float  # as the session is
+    separation_then: float  # with it
+    series: str = ""  # that is taken again; empty: none
+    measured: tuple[Mapping[str, Any], ...] = ()  # new series, as an acquisition's attributes
+    name: str = ""  # of what is measured new
 
     @property
     def settles(self) -> bool:
@@ -146,10 +131,7 @@ class Proposal:
 def advice_text(proposals: Sequence[Proposal], first: Sequence[str], second: Sequence[str], *, lately: bool) -> str:
     """What to measure to distinguish two explanations (effects): what settles it, or, where nothing does, what isolates them.
 
-    Args:
-        proposals: what was weighed, the best one of each kind.
-        first, second: the effects of the explanations.
-        lately: all of them came after the calibration: what that has not seen cannot be made up for.
+    proposals: the best one of each kind; lately: all effects came after the calibration, which has not seen them.
     """
     names = " from ".join(" and ".join(map(title_of, effects)) for effects in (first, second))
     best = next((item for item in proposals if item.settles), None)
@@ -177,14 +159,9 @@ def advice_text(proposals: Sequence[Proposal], first: Sequence[str], second: Seq
 
 
 def best_repeat(problem: Problem, first: Sequence[Point], second: Sequence[Point]) -> Proposal | None:
-    """The series whose repetition would separate two explanations most; None where they are alike everywhere.
+    """The series whose repetition would separate two explanations most; None where they are alike everywhere."""
 
-    Args:
-        problem: of the session.
-        first, second: effects of either explanation, with curves of the problem.
-    """
-
-    def response(explanation: Sequence[Point]) -> NDArray[np.float64]:
+    def response(explanation: Sequence[Point]) -> FloatArray:
         return sum((one.curve.response(one.strength) for one in explanation), np.zeros(len(problem.residual)))
 
     apart = response(first) - response(second)
@@ -211,14 +188,8 @@ def best_repeat(problem: Problem, first: Sequence[Point], second: Sequence[Point
     return max(found, key=lambda item: item.separation_then)
 
 
-def length(factors: NDArray[np.float64], blocks: NDArray[np.intp], moved: NDArray[np.float64]) -> float:
-    """Length of a change of the probes (probe,), standard deviations, nuisances refitted.
-
-    Args:
-        factors: of the nuisances (probe, factor).
-        blocks: within which they are local (probe,).
-        moved: the change.
-    """
+def length(factors: FloatArray, blocks: IndexArray, moved: FloatArray) -> float:
+    """Length of a change of the probes (probe,), sd, nuisances (probe, factor), local in blocks (probe,), refitted."""
     whitening = Whitening(factors, blocks)
     whitened = whitening.apply(moved[None, :])
     return math.sqrt(max(float(Nuisances(whitening.factors).inner(whitened, whitened)[0, 0]), 0.0))

@@ -54,14 +54,8 @@ class SessionPlan(Result):
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row an effect: since, unit, strength taken, separation from none, strength from which it is seen."""
         answer = self.to_dict()
-        columns = {
-            "effect": "effects",
-            "since": "since",
-            "unit": "units",
-            "strength": "strengths",
-            "from_none": "from_none",
-            "seen_from": "seen_from",
-        }
+        columns = {"effect": "effects", "since": "since", "unit": "units", "strength": "strengths"}
+        columns |= {"from_none": "from_none", "seen_from": "seen_from"}
         count = len(answer["effects"])
         return frame([{name: answer[key][row] for name, key in columns.items()} for row in range(count)])
 
@@ -100,14 +94,7 @@ def plan_session(
     without: Sequence[str] = (),
     progress: Callable[[str], None] | None = None,
 ) -> SessionPlan:
-    """The distinguishability matrix of a session's series.
-
-    Args:
-        acquisition, twin, rng, without, progress: as `diagnose`.
-
-    Raises:
-        InputError: nothing in the session can be judged.
-    """
+    """The distinguishability matrix of a session's series; arguments and errors are those of `diagnose`."""
     # thousands of small matrices: threads would wait for each other longer than they work
     with threadpool_limits(limits=1, user_api="blas"):
         session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from ..arrays import FloatArray
 from ..model.curves import Curve, places_of
 from .discrepancy import LEAST_MOVED, LEVELS, Levels, only
 from .observed import Observed, Point
@@ -23,21 +23,16 @@ _REACHES = (0.05, 0.01, 0.002, 0.0004, 0.0)  # least relative widths about which
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CurveFit:
-    """One curve against a residual.
-
-    Fields: curve; by_level (level,): log evidence over none with the law off by each level; at_any_strength (level,): the same with a
-    prior of the strength that is even over all its reach; log_evidence: by_level averaged over the levels' frequencies; level: the
-    likeliest; strengths and log_likelihood (node,) over none at that level; share: as of a `Point`.
-    """
+    """One curve against a residual."""
 
     curve: Curve
-    by_level: NDArray[np.float64]
-    at_any_strength: NDArray[np.float64]
-    log_evidence: float
-    level: float
-    strengths: NDArray[np.float64]
-    log_likelihood: NDArray[np.float64]
-    share: float = 0.0
+    by_level: FloatArray  # (level,): log evidence over none with the law off by each level
+    at_any_strength: FloatArray  # (level,): the same with a prior of the strength that is even over all its reach
+    log_evidence: float  # by_level averaged over the levels' frequencies
+    level: float  # the likeliest
+    strengths: FloatArray  # (node,)
+    log_likelihood: FloatArray  # (node,) over none at that level
+    share: float = 0.0  # as of a `Point`
 
     @property
     def best(self) -> float:
@@ -58,20 +53,15 @@ class CurveFit:
         return _over_levels(self.at_any_strength if any_strength else self.by_level, LEVELS.of_another)
 
 
-def _over_levels(by_level: NDArray[np.float64], frequencies: Sequence[float]) -> float:
+def _over_levels(by_level: FloatArray, frequencies: Sequence[float]) -> float:
     return float(logsumexp(by_level, b=np.asarray(frequencies[: len(by_level)])))
 
 
 def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS) -> CurveFit:
-    """Evidence of one curve over none, its strength integrated over a log-uniform prior, see `log_integral`.
+    """Evidence of one curve, in the units of the first probes, over none, its strength integrated out, see `log_integral`.
 
     What an effect does by chance grows with its strength; at each level the covariance is that of the law at its best strength, found
     in rounds.
-
-    Args:
-        observed: what is weighed.
-        curve: in the units of the first probes.
-        levels: of discrepancy.
     """
     scaled = observed.scaled(curve)
     (sharp,) = _Terms.of_each(observed, [scaled])
@@ -103,23 +93,6 @@ def _fit_of(curve: Curve, found: Sequence["_Likelihood"], levels: Levels) -> Cur
     )
 
 
-def fit_effect(observed: Observed, curve: Curve) -> CurveFit:
-    """A curve fitted to what is weighed, where the twin has all its effects but this one; evidence over all that it has."""
-    alone = observed.conditioned(curve.effect)
-    return _over_given(observed, fit_curve(alone, curve))
-
-
-def first_looks_at_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
-    """The same of several curves with their laws taken as exact."""
-    given = [curve for curve in curves if observed.has(curve.effect)]
-    others = [curve for curve in curves if not observed.has(curve.effect)]
-    found = dict(zip(map(id, others), first_looks(observed.conditioned(), others), strict=True))
-    for curve in given:
-        (fit,) = first_looks(observed.conditioned(curve.effect), [curve])
-        found[id(curve)] = _over_given(observed, fit)
-    return [found[id(curve)] for curve in curves]
-
-
 def _over_given(observed: Observed, fit: CurveFit) -> CurveFit:
     """A fit where the twin has all its effects but this one, its evidence over all that it has."""
     more = observed.log_evidence_without(fit.curve.effect)
@@ -133,7 +106,14 @@ def _over_given(observed: Observed, fit: CurveFit) -> CurveFit:
 
 def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
     """Every curve fitted: with all levels of discrepancy those variants of an effect that are likeliest, or close to it, if exact."""
-    found = first_looks_at_effects(observed, curves)
+    # where the twin has all its effects but each curve's own
+    others = iter(first_looks(observed.conditioned(), [curve for curve in curves if not observed.has(curve.effect)]))
+    found = [
+        _over_given(observed, first_looks(observed.conditioned(curve.effect), [curve])[0])
+        if observed.has(curve.effect)
+        else next(others)
+        for curve in curves
+    ]
     ranked: dict[str, list[int]] = {}
     for number in sorted(range(len(curves)), key=lambda number: -found[number].log_evidence):
         ranked.setdefault(curves[number].effect, []).append(number)
@@ -141,7 +121,8 @@ def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
         least = found[numbers[0]].log_evidence - _CLOSE
         close = max(IN_FULL, sum(found[number].log_evidence > least for number in numbers))
         for number in numbers[:close]:
-            found[number] = fit_effect(observed, curves[number])
+            curve = curves[number]
+            found[number] = _over_given(observed, fit_curve(observed.conditioned(curve.effect), curve))
         for number in numbers[close:]:
             # of the others no more is counted than an exact law's part, as often as laws are exact
             exact = found[number].log_evidence + math.log(LEVELS.of_kind[0])
@@ -153,8 +134,8 @@ def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
 class _Likelihood:
     """Log likelihood over none (node,) of a curve at strengths (node,)."""
 
-    strengths: NDArray[np.float64]
-    values: NDArray[np.float64]
+    strengths: FloatArray
+    values: FloatArray
 
     def log_evidence(self, low: float, high: float) -> float:
         """Under a prior of a strength that is plausible from low to high."""
@@ -186,7 +167,7 @@ class _Terms:
             found.append(cls(curve, own @ own.T - left @ left.T, of_residual))
         return found
 
-    def __init__(self, curve: Curve, inner: NDArray[np.float64], of_residual: NDArray[np.float64]) -> None:
+    def __init__(self, curve: Curve, inner: FloatArray, of_residual: FloatArray) -> None:
         """Of the curve's responses, and what it does by chance after them: a C^-1 b, and a C^-1 r."""
         self._curve = curve
         nodes = len(curve.responses)
@@ -195,7 +176,7 @@ class _Terms:
         self._values = np.maximum(self._values, 0.0)
         self._of_nodes, self._of_residual = inner[:nodes, nodes:] @ vectors, of_residual[nodes:] @ vectors
 
-    def at(self, strengths: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def at(self, strengths: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Log likelihood over none, and squared length of the response, at strengths."""
         weights = self._curve.weights(strengths)
         quadratic = np.einsum("si,ij,sj->s", weights, self._gram, weights)
@@ -239,20 +220,20 @@ def _off_by(observed: Observed, curve: Curve, exact: _Likelihood, level: float, 
     return found
 
 
-def _chance_of(curve: Curve) -> NDArray[np.float64]:
+def _chance_of(curve: Curve) -> FloatArray:
     """What a curve does by chance a unit of strength (factor, probe); what moves nothing that shows is left out."""
     shows = np.max(np.abs(curve.chance), axis=0, initial=0.0) * curve.reach[1] >= LEAST_MOVED
     return np.asarray(curve.chance[:, shows].T)
 
 
-def refined(strengths: NDArray[np.float64], best: float, width: float) -> NDArray[np.float64]:
+def refined(strengths: FloatArray, best: float, width: float) -> FloatArray:
     """Nodes with a finer set about `best`, 6 relative widths to each side."""
     span = np.linspace(-6.0, 6.0, 49) * min(max(width, 1e-6), 0.5)
     near = best * np.exp(span)
     return np.unique(np.concatenate([strengths, near[(near >= strengths[0]) & (near <= strengths[-1])]]))
 
 
-def log_integral(strengths: NDArray[np.float64], log_likelihood: NDArray[np.float64], low: float, high: float) -> float:
+def log_integral(strengths: FloatArray, log_likelihood: FloatArray, low: float, high: float) -> float:
     """log of the mean likelihood under a prior that is even in the logarithm of the strength.
 
     Most of it from low to high, IMPLAUSIBLE beyond: a line may be better, or worse, than the catalogue takes for plausible.
@@ -286,7 +267,7 @@ def interval_of(fits: Sequence[CurveFit]) -> tuple[float, float, float]:
     return interval_under(nodes, total)
 
 
-def interval_under(strengths: NDArray[np.float64], log_likelihood: NDArray[np.float64]) -> tuple[float, float, float]:
+def interval_under(strengths: FloatArray, log_likelihood: FloatArray) -> tuple[float, float, float]:
     x = np.log(strengths)
     density = np.exp(log_likelihood - log_likelihood.max())
     cumulated = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(x))])

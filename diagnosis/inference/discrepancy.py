@@ -13,30 +13,24 @@ from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
+from ..arrays import FloatArray, IndexArray
 from ..model.curves import Curve
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Levels:
-    """Levels of discrepancy and how often they occur.
+    """Levels of discrepancy and how often they occur."""
 
-    Fields: levels (level,), relative; of_kind (level,): their frequencies where the effect is of the kind that a law describes;
-    of_another: where it is not, and the law is the one of the catalogue that resembles it most; misfit_of_kind, misfit_of_another:
-    how often such a law leaves a misfit in some families of probes beyond that; misfit_sd_of_kind: of the length of a misfit over
-    that of what the laws do, as a Gaussian about 0; misfit_of_another_log: mean and standard deviation of the logarithm of that, a
-    Gaussian.
-    """
-
-    levels: tuple[float, ...]
-    of_kind: tuple[float, ...]
+    levels: tuple[float, ...]  # (level,), relative
+    of_kind: tuple[float, ...]  # (level,): frequencies where the effect is of the kind that a law describes
+    # (level,): where it is not, and the law is the one of the catalogue that resembles it most
     of_another: tuple[float, ...]
-    misfit_of_kind: float
-    misfit_of_another: float
-    misfit_sd_of_kind: float
-    misfit_of_another_log: tuple[float, float]
+    misfit_of_kind: float  # how often such a law leaves a misfit in some families of probes beyond that
+    misfit_of_another: float  # the same of the others
+    misfit_sd_of_kind: float  # of the length of a misfit over that of what the laws do, a Gaussian about 0
+    misfit_of_another_log: tuple[float, float]  # mean and standard deviation of the logarithm of that, a Gaussian
 
     def up_to(self, level: float) -> "Levels":
         """Those up to a level, with frequencies as they are."""
@@ -81,7 +75,7 @@ LEAST_MOVED = 0.3  # standard deviations of a probe by which what is random abou
 _TIMES_SEEN = 1.5
 
 
-def credible(response: NDArray[np.float64], seen: NDArray[np.float64], places: NDArray[np.intp]) -> NDArray[np.float64]:
+def credible(response: FloatArray, seen: FloatArray, places: IndexArray) -> FloatArray:
     """The part of a response (probe,) that its law's inaccuracy is a share of: in each place no more than `_TIMES_SEEN` what is seen.
 
     A law that predicts thousands of standard deviations where nothing is seen is wrong by all of them, not off by a share.
@@ -94,31 +88,21 @@ def credible(response: NDArray[np.float64], seen: NDArray[np.float64], places: N
 
 @dataclass(frozen=True, slots=True)
 class LawFactors:
-    """What is random about effects at their strengths.
+    """What is random about effects at their strengths."""
 
-    Fields: of_laws (factor, probe): a row for each group of probes and effect, what the law is off by there; spread (probe, factor):
-    what the effects do by chance.
-    """
-
-    of_laws: csc_array
-    spread: NDArray[np.float64]
+    of_laws: csc_array  # (factor, probe): what the law is off by, a row for each group of probes and effect
+    spread: FloatArray  # (probe, factor): what the effects do by chance
 
     def __bool__(self) -> bool:
         return bool(self.of_laws.shape[0] or self.spread.shape[1])
 
-    def full(self) -> NDArray[np.float64]:
+    def full(self) -> FloatArray:
         """All of them (probe, factor)."""
         return np.concatenate([self.of_laws.toarray().T, self.spread], axis=1)
 
 
 def law_factors(
-    curve: Curve,
-    strength: float,
-    response: NDArray[np.float64],
-    groups: NDArray[np.intp],
-    level: float,
-    *,
-    chance: bool = True,
+    curve: Curve, strength: float, response: FloatArray, groups: IndexArray, level: float, *, chance: bool = True
 ) -> LawFactors:
     """What is random about an effect at a strength: its law's inaccuracy, and, with `chance`, its own spread."""
     if curve.exact is not None:
@@ -130,7 +114,7 @@ def law_factors(
     return LawFactors(group_factors(response, groups, level if moves else 0.0), spread * strength)
 
 
-def group_factors(response: NDArray[np.float64], groups: NDArray[np.intp], sd: float) -> csc_array:
+def group_factors(response: FloatArray, groups: IndexArray, sd: float) -> csc_array:
     """A row (factor, probe) a group: the response there times `sd`; groups in which it would move nothing are left out."""
     power = np.bincount(groups, weights=response**2)
     kept = sd**2 * power > LEAST_FACTOR
@@ -140,11 +124,9 @@ def group_factors(response: NDArray[np.float64], groups: NDArray[np.intp], sd: f
     return csc_array((sd * response[inside], places, starts), shape=(int(np.count_nonzero(kept)), len(response)))
 
 
-def own_variance(
-    curve: Curve, strength: float, effective: NDArray[np.float64], places: NDArray[np.intp], level: float
-) -> NDArray[np.float64]:
+def own_variance(curve: Curve, strength: float, effective: FloatArray, places: IndexArray, level: float) -> FloatArray:
     """Variance (probe,) that an effect gives each probe by itself: by its law's discrepancy, and by chance."""
-    share: float | NDArray[np.float64] = PROBE_SHARE * level
+    share: float | FloatArray = PROBE_SHARE * level
     if curve.exact is not None:
         share = np.where(curve.exact, EXACT_LAW_ERROR, share)
     own = (share * effective) ** 2
@@ -155,8 +137,8 @@ def own_variance(
 
 
 def law_terms(
-    curve: Curve, strength: float, groups: NDArray[np.intp], places: NDArray[np.intp], level: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    curve: Curve, strength: float, groups: IndexArray, places: IndexArray, level: float
+) -> tuple[FloatArray, FloatArray]:
     """What a law that is off by so much adds: factors (probe, factor) and each probe's own variance (probe,)."""
     response = curve.response(strength)
     factors = law_factors(curve, strength, response, groups, level).full()
@@ -176,15 +158,19 @@ def log_misfit(ratio: float, *, another: bool = False) -> float:
     return math.log(share) + 0.5 * math.log(2.0 / math.pi) - 0.5 * share**2
 
 
-def leak_density(ratio: NDArray[np.float64], level: float, least: float) -> NDArray[np.float64]:
+def leak_density(ratio: FloatArray, level: float, least: float) -> FloatArray:
     """Density, in the logarithm of it, of what a law leaves in the shape of another effect over what it does itself.
 
     Even from `least`, below which it does not show, to the level, and falling as a Gaussian beyond; nothing where a law of this level
     leaves nothing that shows.
     """
+    from scipy.special import exp1
+
     if level <= least:
         return np.zeros_like(ratio)
-    return np.asarray(np.where(ratio < least, 0.0, np.exp(-0.5 * (ratio / level) ** 2)) / _leak_width(level, least))
+    # the integral of exp(-(x / level)^2 / 2) over the logarithm of x from `least` on
+    width = float(0.5 * exp1(0.5 * (least / level) ** 2))
+    return np.asarray(np.where(ratio < least, 0.0, np.exp(-0.5 * (ratio / level) ** 2)) / width)
 
 
 def leak_below(ratio: float, level: float, least: float) -> float:
@@ -195,10 +181,3 @@ def leak_below(ratio: float, level: float, least: float) -> float:
         return 0.0
     inside = np.geomspace(least, ratio, 200)
     return float(np.trapezoid(leak_density(inside, level, least), np.log(inside)))
-
-
-def _leak_width(most: float, least: float) -> float:
-    """Integral of exp(-(x / most)^2 / 2) over the logarithm of x from `least` on: E1((least / most)^2 / 2) / 2."""
-    from scipy.special import exp1
-
-    return float(0.5 * exp1(0.5 * (least / most) ** 2))

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import FloatArray, IndexArray
 from ..model.changes import Variant
 from .curve_fits import CurveFit
 from .observed import Observed
@@ -21,16 +21,11 @@ class InSome:
     log_prior: float
 
 
-def in_some_series(observed: Observed, fits: Sequence[CurveFit], series_of: NDArray[np.intp]) -> InSome | None:
-    """In which series one effect acts; None: no part of them explains more than all.
+def in_some_series(observed: Observed, fits: Sequence[CurveFit], series_of: IndexArray) -> InSome | None:
+    """In which series one effect, of these fits, acts; None: no part of them explains more than all.
 
     Series are taken in one after the other, the one that explains most first, law and nuisances as in a fit to all. Any number of
-    series is as likely as another, and so are all sets of so many.
-
-    Args:
-        observed: what is weighed.
-        fits: of the effect's curves to it.
-        series_of: number of each probe's series (probe,).
+    series is as likely as another, and so are all sets of so many. series_of: number of each probe's series (probe,).
     """
     best: InSome | None = None
     most = 0.0
@@ -42,9 +37,7 @@ def in_some_series(observed: Observed, fits: Sequence[CurveFit], series_of: NDAr
     return best
 
 
-def _chosen(
-    observed: Observed, response: NDArray[np.float64], series_of: NDArray[np.intp]
-) -> tuple[tuple[int, ...], float, float]:
+def _chosen(observed: Observed, response: FloatArray, series_of: IndexArray) -> tuple[tuple[int, ...], float, float]:
     """Series of one response, the log evidence that they bring over all of them, and their log prior; none where that is no gain."""
     numbers = np.unique(series_of[np.abs(response) > 0.0])
     if len(numbers) < 2:

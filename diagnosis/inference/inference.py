@@ -42,21 +42,17 @@ def title_of(effect: str) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hypothesis:
-    """One explanation and how probable it is.
+    """One explanation and how probable it is."""
 
-    Fields: effects (ids; empty for none; `("unknown_effect",)` for an effect outside the catalogue); probability; log_evidence;
-    strengths per effect: best value and 95 % interval (value, low, high); variants per effect; levels: of discrepancy, per effect;
-    location: probe group of an unknown effect; misfit: the family in which laws leave most, empty where they leave nothing.
-    """
-
-    effects: tuple[str, ...]
+    effects: tuple[str, ...]  # ids; empty for none; `("unknown_effect",)` for an effect outside the catalogue
     probability: float
     log_evidence: float
+    # best value and 95 % interval (value, low, high), by effect
     strengths: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
-    variants: Mapping[str, Curve] = field(default_factory=dict)
-    levels: Mapping[str, float] = field(default_factory=dict)
-    location: str = ""
-    misfit: str = ""
+    variants: Mapping[str, Curve] = field(default_factory=dict)  # by effect
+    levels: Mapping[str, float] = field(default_factory=dict)  # of discrepancy, by effect
+    location: str = ""  # probe group of an unknown effect
+    misfit: str = ""  # the family in which laws leave most; empty: they leave nothing
 
     @property
     def of_catalogue(self) -> bool:
@@ -99,11 +95,9 @@ def weigh_hypotheses(
     the twin.
 
     Args:
-        seen: standardised probes less the twin's with what may vary, and the fits of each effect's curves to it; several curves of
-            one effect are variants with equal prior. Several of these for several levels by which laws of the twin's own effects may
-            be off, over which the evidence is averaged.
+        seen: what is weighed, and the fits of each effect's curves, variants with equal prior, to it; several of these for several
+            levels by which laws of the twin's own effects may be off, over which the evidence is averaged.
         families: of probes, in which an unknown effect may show.
-        priors: of the kinds of hypothesis.
         of_catalogue: number of effects that share the priors, those that cannot show here among them; at least those with fits.
         misfits: laws may leave a misfit; False: they may not, a first look at a third of the cost.
         beside: curves of effects as they respond beside another.
@@ -174,10 +168,8 @@ def _weighed(
         if alone.log_evidence > leaks.get(strong, singles[strong]).log_evidence:
             leaks[strong] = alone
     weighed += [(item, of_single) for item in leaks.values()]
-    of_one = float(np.logaddexp.reduce(alike)) - math.log(count) if alike else -math.inf
-    of_two = (
-        float(np.logaddexp.reduce(like_two)) - math.log(max(count * (count - 1) // 2, 1)) if like_two else -math.inf
-    )
+    of_one = float(np.logaddexp.reduce(alike)) - math.log(count)
+    of_two = float(np.logaddexp.reduce(like_two)) - math.log(max(count * (count - 1) // 2, 1))
     # like none of the catalogue, like one or like two, each as likely
     evidence = float(np.logaddexp.reduce([none.log_evidence, of_one, of_two])) - math.log(3.0)
     unknown = Hypothesis(effects=(UNKNOWN,), probability=0.0, log_evidence=evidence, location=none.place)
@@ -188,10 +180,7 @@ def _weighed(
 def _left_by_given(
     observed: Observed, singles: Mapping[str, Single], weighed: Mapping[str, Hypothesis]
 ) -> float | None:
-    """Log evidence over none of what laws of the twin's own effects leave in the shape of another; None: the twin has none.
-
-    weighed: each effect alone, with a misfit or without.
-    """
+    """Log evidence over none of what laws of the twin's own effects leave in the shape of another; None: the twin has none."""
     given = [point.effect for point in observed.given]
     others = [one for one in singles if one not in given and any(may_leave(effect, one) for effect in given)]
     if not others:

@@ -30,14 +30,7 @@ _SD = 1.0 / math.sqrt(3.0)  # of what is even over a range, in halves of it
 def with_inner_open(
     hypothesis: Hypothesis, *, observed: Observed, respond: Responder, whitening: Whitening
 ) -> Hypothesis:
-    """A hypothesis whose strengths' intervals hold what its laws' inner parameters leave open.
-
-    Args:
-        hypothesis: with whitened curves.
-        observed: what is weighed, whitened.
-        respond: asks the forward model.
-        whitening: of its responses.
-    """
+    """A hypothesis, its curves whitened, whose strengths' intervals hold what its laws' inner parameters leave open."""
     seen = FitTarget(observed=replace(observed, given=()), respond=respond, whitening=whitening)
     opened = {point.effect: _opened(point.curve, point.strength, seen) for point in hypothesis.points()}
     if all(opened[effect] is curve for effect, curve in hypothesis.variants.items()):

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csc_array, vstack
 
+from ..arrays import BoolArray, FloatArray, IndexArray, RealArray
 from ..model.curves import Curve, places_of
 
 
@@ -23,7 +23,7 @@ class Nuisances:
     column a group of probes and effect. E is integrated out first: with one effect it costs no more than its entries.
     """
 
-    def __init__(self, factors: NDArray[np.float64], of_laws: csc_array | None = None) -> None:
+    def __init__(self, factors: FloatArray, of_laws: csc_array | None = None) -> None:
         """Both give the response to one prior standard deviation of each nuisance."""
         self.factors = factors
         self.of_laws = of_laws if of_laws is not None and of_laws.shape[0] else None
@@ -34,37 +34,39 @@ class Nuisances:
             self._shared = _half(self._laws, self.of_laws @ factors)
             normal -= self._shared.T @ self._shared
             self.log_determinant = _log_determinant(self._laws)
-        self._cholesky: NDArray[np.float64] = np.asarray(np.linalg.cholesky(normal))
+        self._cholesky: FloatArray = np.asarray(np.linalg.cholesky(normal))
         self.log_determinant += _log_determinant(self._cholesky)
 
-    def over(self, root: NDArray[np.float64], factors: NDArray[np.float64], of_laws: csc_array) -> "Nuisances":
+    def over(self, root: FloatArray, factors: FloatArray, of_laws: csc_array) -> "Nuisances":
         """With more factors of both kinds, of probes whose standard deviations are `root` (probe,) times as large."""
         inverse = 1.0 / root
         wider = self.factors if not factors.shape[1] else np.concatenate([self.factors, factors], axis=1)
         every = of_laws if self.of_laws is None else vstack([self.of_laws, of_laws], format="csc")
-        return Nuisances(wider * inverse[:, None], _scaled(every, inverse))
+        data = every.data * np.repeat(inverse, np.diff(every.indptr))
+        scaled = csc_array((data, every.indices, every.indptr), shape=every.shape)
+        return Nuisances(wider * inverse[:, None], scaled)
 
-    def full(self) -> NDArray[np.float64]:
+    def full(self) -> FloatArray:
         """All factors (probe, factor)."""
         if self.of_laws is None:
             return self.factors
         return np.concatenate([self.factors, self.of_laws.toarray().T], axis=1)
 
-    def of_probes(self, probes: NDArray[np.bool_]) -> "Nuisances":
+    def of_probes(self, probes: BoolArray) -> "Nuisances":
         """Of some of its probes (probe,)."""
         return Nuisances(
             self.factors[probes], None if self.of_laws is None else self.of_laws[:, np.flatnonzero(probes)]
         )
 
-    def project(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def project(self, vectors: FloatArray) -> FloatArray:
         """z (vector, factor) with a^T C^-1 b = a.b - z_a.z_b for vectors (vector, probe)."""
         return self._projected(self.factors.T @ vectors.T, None if self.of_laws is None else self.of_laws @ vectors.T)
 
-    def project_each(self) -> NDArray[np.float64]:
+    def project_each(self) -> FloatArray:
         """The same (probe, factor) of each probe by itself."""
         return self._projected(self.factors.T, None if self.of_laws is None else self.of_laws.toarray())
 
-    def _projected(self, of_factors: NDArray[np.float64], of_laws: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    def _projected(self, of_factors: FloatArray, of_laws: FloatArray | None) -> FloatArray:
         """z (vector, factor), from factors times vectors (factor, vector) of both kinds."""
         if of_laws is None:
             return _half(self._cholesky, of_factors).T
@@ -72,16 +74,16 @@ class Nuisances:
         right = of_factors - self._shared.T @ own
         return np.concatenate([own, _half(self._cholesky, right)]).T
 
-    def inner(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    def inner(self, a: FloatArray, b: FloatArray) -> FloatArray:
         """Matrix a C^-1 b^T for a (i, probe), b (j, probe)."""
         left = self.project(a)
         return np.asarray(a @ b.T - left @ (left if b is a else self.project(b)).T)
 
-    def solve(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    def solve(self, vector: FloatArray) -> FloatArray:
         """C^-1 vector (probe,)."""
         return np.asarray(self.solve_all(vector[None, :])[0])
 
-    def solve_all(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def solve_all(self, vectors: FloatArray) -> FloatArray:
         """C^-1 of each of the vectors (vector, probe): what the nuisances leave of them."""
         from scipy.linalg import cho_solve
 
@@ -95,7 +97,7 @@ class Nuisances:
         return np.asarray(vectors - fitted.T @ self.factors.T - (self.of_laws.T @ of_laws).T)
 
 
-def _root_of_laws(of_laws: csc_array) -> NDArray[np.floating]:
+def _root_of_laws(of_laws: csc_array) -> RealArray:
     """L of I + E^T E = L L^T; its diagonal (factor,) where no probe has two of the columns."""
     if int(np.max(np.diff(of_laws.indptr), initial=0)) <= 1:
         squares = np.bincount(of_laws.indices, weights=of_laws.data**2, minlength=of_laws.shape[0])
@@ -103,21 +105,15 @@ def _root_of_laws(of_laws: csc_array) -> NDArray[np.floating]:
     return np.linalg.cholesky(np.eye(of_laws.shape[0]) + (of_laws @ of_laws.T).toarray())
 
 
-def _log_determinant(root: NDArray[np.floating]) -> float:
+def _log_determinant(root: RealArray) -> float:
     """Of L L^T; root: L, or its diagonal alone."""
     return 2.0 * float(np.sum(np.log(root if root.ndim == 1 else np.diag(root))))
-
-
-def _scaled(of_laws: csc_array, factor: NDArray[np.float64]) -> csc_array:
-    """Columns of (factor, probe) times `factor` (probe,)."""
-    data = of_laws.data * np.repeat(factor, np.diff(of_laws.indptr))
-    return csc_array((data, of_laws.indices, of_laws.indptr), shape=of_laws.shape)
 
 
 class Whitening:
     """Integrates out every factor that lies within one block; `factors` are the shared ones that are left, whitened."""
 
-    def __init__(self, factors: NDArray[np.float64], blocks: NDArray[np.intp]) -> None:
+    def __init__(self, factors: FloatArray, blocks: IndexArray) -> None:
         """`factors` (probe, factor), `blocks` (probe,): block of each probe."""
         of_block, shared = local_columns(factors, blocks)
         self._members = []
@@ -127,9 +123,9 @@ class Whitening:
             own = factors[np.ix_(members, of_block.get(int(block), np.zeros(0, np.intp)))]
             self._members.append(members)
             self._lower.append(np.linalg.cholesky(np.eye(len(members)) + own @ own.T))
-        self.factors: NDArray[np.float64] = np.ascontiguousarray(self.apply(factors[:, shared].T).T)
+        self.factors: FloatArray = np.ascontiguousarray(self.apply(factors[:, shared].T).T)
 
-    def apply(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def apply(self, vectors: FloatArray) -> FloatArray:
         """Vectors (vector, probe) with unit noise once the local nuisances are integrated out."""
         result = np.zeros(vectors.shape)
         for members, lower in zip(self._members, self._lower, strict=True):
@@ -139,14 +135,14 @@ class Whitening:
                 result[np.ix_(there, members)] = _half(lower, own[there].T).T
         return result
 
-    def undo(self, whitened: NDArray[np.float64]) -> NDArray[np.float64]:
+    def undo(self, whitened: FloatArray) -> FloatArray:
         """Vectors (vector, probe) as they were before `apply`."""
         result = np.zeros(whitened.shape)
         for members, lower in zip(self._members, self._lower, strict=True):
             result[:, members] = whitened[:, members] @ lower.T
         return result
 
-    def variances(self, variances: NDArray[np.float64]) -> NDArray[np.float64]:
+    def variances(self, variances: FloatArray) -> FloatArray:
         """Variances (probe,) of independent extra noise of the probes, as they are in whitened ones."""
         result = np.empty_like(variances)
         for members, lower in zip(self._members, self._lower, strict=True):
@@ -174,7 +170,7 @@ class LocalNuisances:
     I + F^T F is an arrow: a small matrix a block, and what all share along its last rows. Its Cholesky factor is one too.
     """
 
-    def __init__(self, factors: NDArray[np.float64], blocks: NDArray[np.intp]) -> None:
+    def __init__(self, factors: FloatArray, blocks: IndexArray) -> None:
         """`factors` (probe, factor): response to one prior standard deviation of each nuisance; `blocks` (probe,): block of each."""
         self.factors = factors
         of_block, shared = local_columns(factors, blocks)
@@ -182,41 +178,48 @@ class LocalNuisances:
         self._order = np.concatenate([*of_block.values(), shared])
         across = np.ascontiguousarray(factors[:, shared])
         normal = np.eye(width) + across.T @ across
-        self._parts: list[tuple[slice, NDArray[np.float64], NDArray[np.float64]]] = []
+        self._parts: list[tuple[slice, FloatArray, FloatArray]] = []
         start = 0
         for block, columns in of_block.items():
             members = np.nonzero(blocks == block)[0]
             own = factors[np.ix_(members, columns)]
-            lower: NDArray[np.float64] = np.asarray(np.linalg.cholesky(np.eye(len(columns)) + own.T @ own))
+            lower: FloatArray = np.asarray(np.linalg.cholesky(np.eye(len(columns)) + own.T @ own))
             coupling = _half(lower, own.T @ across[members])
             normal -= coupling.T @ coupling
             self._parts.append((slice(start, start + len(columns)), lower, coupling))
             start += len(columns)
         self._across = slice(start, start + width)
-        self._cholesky: NDArray[np.float64] = np.asarray(np.linalg.cholesky(normal))
+        self._cholesky: FloatArray = np.asarray(np.linalg.cholesky(normal))
 
-    def fitted(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    def fitted(self, vector: FloatArray) -> FloatArray:
         """Most probable nuisances (factor,), in prior standard deviations, for a residual (probe,)."""
-        return np.asarray(self._solved((self.factors.T @ vector)[:, None])[:, 0])
+        half = self._halved((self.factors.T @ vector)[:, None])
+        across = _half(self._cholesky, half[self._across], transposed=True)
+        half[self._across] = across
+        for part, lower, coupling in self._parts:
+            half[part] = _half(lower, half[part] - coupling @ across, transposed=True)
+        result = np.empty(len(half))
+        result[self._order] = half[:, 0]
+        return result
 
-    def solve(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    def solve(self, vector: FloatArray) -> FloatArray:
         """C^-1 vector (probe,)."""
         return np.asarray(vector - self.factors @ self.fitted(vector))
 
-    def given_others(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    def given_others(self, vector: FloatArray) -> FloatArray:
         """Each probe (probe,) as the others do not tell it, in standard deviations: (C^-1 r)_i / sqrt((C^-1)_ii)."""
         return np.asarray(self.solve(vector) / np.sqrt(np.maximum(self.precision, 1e-12)))
 
     @property
-    def precision(self) -> NDArray[np.float64]:
+    def precision(self) -> FloatArray:
         """Diagonal (probe,) of C^-1: what of each probe's variance the others do not tell."""
         return np.asarray(1.0 - self.known_of(self.factors))
 
-    def known_of(self, factors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def known_of(self, factors: FloatArray) -> FloatArray:
         """Variance (probe,) that the nuisances, fitted on the own probes, still give to probes with these factors."""
         return np.asarray(np.sum(self._halved(factors.T) ** 2, axis=0))
 
-    def _halved(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _halved(self, right: FloatArray) -> FloatArray:
         """L^-1 of (factor, vector), in the arrow's order."""
         right = right[self._order]
         across = right[self._across]
@@ -230,21 +233,8 @@ class LocalNuisances:
         right[self._across] = _half(self._cholesky, across)
         return right
 
-    def _solved(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(I + F^T F)^-1 of (factor, vector)."""
-        half = self._halved(right)
-        across = _half(self._cholesky, half[self._across], transposed=True)
-        half[self._across] = across
-        for part, lower, coupling in self._parts:
-            half[part] = _half(lower, half[part] - coupling @ across, transposed=True)
-        result = np.empty_like(half)
-        result[self._order] = half
-        return result
 
-
-def local_columns(
-    factors: NDArray[np.float64], blocks: NDArray[np.intp]
-) -> tuple[dict[int, NDArray[np.intp]], NDArray[np.intp]]:
+def local_columns(factors: FloatArray, blocks: IndexArray) -> tuple[dict[int, IndexArray], IndexArray]:
     """Columns of factors (probe, factor) that touch one block alone (or none), by block, and those that touch several."""
     numbers, inverse = np.unique(blocks, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
@@ -256,7 +246,7 @@ def local_columns(
     return {block: columns for block, columns in found.items() if len(columns)}, np.nonzero(~alone)[0]
 
 
-def _half(lower: NDArray[np.floating], right: NDArray[np.float64], *, transposed: bool = False) -> NDArray[np.float64]:
+def _half(lower: RealArray, right: FloatArray, *, transposed: bool = False) -> FloatArray:
     """L^-1 right, or L^-T right, for a triangle L, or a diagonal (row,) that stands for one."""
     from scipy.linalg import solve_triangular
 

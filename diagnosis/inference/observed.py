@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..model.curves import Curve
 from .discrepancy import LEAST_FACTOR, credible, law_factors, own_variance
 from .nuisances import Nuisances
@@ -20,17 +20,14 @@ FREE_SD = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Point:
-    """An effect at a strength, its law off by a level; the curve is in the units of the probes before any effect is taken off.
+    """An effect at a strength, its law off by a level."""
 
-    strength_sd: of the logarithm of the strength, a Gaussian: how free it is beside something else that is sought; share: log of the
-    mean likelihood of all the effect's variants over this one's.
-    """
-
-    curve: Curve
+    curve: Curve  # in the units of the probes before any effect is taken off
     strength: float
     level: float
+    # of the logarithm of the strength, a Gaussian: how free it is beside something else that is sought
     strength_sd: float = FREE_SD
-    share: float = 0.0
+    share: float = 0.0  # log of the mean likelihood of all the effect's variants over this one's
 
     @property
     def effect(self) -> str:
@@ -40,34 +37,26 @@ class Point:
 
 @dataclass(frozen=True, kw_only=True)
 class Observed:
-    """A residual and its covariance.
+    """A residual and its covariance."""
 
-    Fields: residual (probe,), in standard deviations; nuisances, their factor model; groups (probe,), within which a law is
-    off by one factor; places (probe,), within which it is off by a share of no more than what is seen there; series (probe,):
-    a law leaves nothing that shows in a series, or in a part of it, that it does not move; aspects (probe,): series with what
-    their mean shows and each kind of what their frames differ by apart (None: `series`): a law of a known course leaves no
-    more in one than it moves there; steady: what of an effect a steady law could leave (None: all of it); root (probe,):
-    standard deviations of the probes in the units of the first (None: 1); given: effects that the twin has, which are still
-    in the residual: `conditioned` takes them off.
-    """
-
-    residual: NDArray[np.float64]
-    nuisances: Nuisances
-    groups: NDArray[np.intp]
-    places: NDArray[np.intp]
-    series: NDArray[np.intp]
-    aspects: NDArray[np.intp] | None = None
-    steady: Steady | None = None
-    root: NDArray[np.float64] | None = None
-    given: tuple[Point, ...] = ()
+    residual: FloatArray  # (probe,), in standard deviations
+    nuisances: Nuisances  # their factor model
+    groups: IndexArray  # (probe,), within which a law is off by one factor
+    places: IndexArray  # (probe,), within which it is off by a share of no more than what is seen there
+    series: IndexArray  # (probe,): a law leaves nothing that shows in a series, or a part of it, that it does not move
+    # (probe,): series, mean and kinds of frames' differences apart, for laws of a known course; None: `series`
+    aspects: IndexArray | None = None
+    steady: Steady | None = None  # what of an effect a steady law could leave; None: all of it
+    root: FloatArray | None = None  # (probe,): standard deviations in the units of the first probes; None: 1
+    given: tuple[Point, ...] = ()  # effects that the twin has, still in the residual: `conditioned` takes them off
 
     @property
-    def units(self) -> NDArray[np.float64]:
+    def units(self) -> FloatArray:
         """Standard deviations (probe,) of the probes in the units of the first."""
         return np.ones(len(self.residual)) if self.root is None else self.root
 
     @cached_property
-    def left(self) -> NDArray[np.float64]:
+    def left(self) -> FloatArray:
         """What the nuisances leave of the residual (probe,)."""
         return self.nuisances.solve(self.residual)
 
@@ -78,7 +67,7 @@ class Observed:
         return -0.5 * (self.nuisances.log_determinant + squares) - float(np.sum(np.log(self.units)))
 
     @cached_property
-    def _projected_alone(self) -> NDArray[np.float64]:
+    def _projected_alone(self) -> FloatArray:
         """What nuisances make of each probe by itself (probe, factor), as `Nuisances.project` has it."""
         return self.nuisances.project_each()
 
@@ -150,13 +139,13 @@ class Observed:
         inner = left.nuisances.inner(both, both)
         return float(inner[0, 1]), max(float(inner[1, 1]), 0.0)
 
-    def _less(self, point: Point) -> tuple["Observed", NDArray[np.float64]]:
+    def _less(self, point: Point) -> tuple["Observed", FloatArray]:
         """What an effect leaves at a point, and the slope (probe,) of its response with the logarithm of the strength."""
         wide = self.widened(self.scaled(point.curve), point.strength, point.level) or self
         own = wide.scaled(point.curve)
         return replace(wide, residual=wide.residual - own.response(point.strength)), slope(own, point.strength)
 
-    def of_probes(self, probes: NDArray[np.bool_]) -> "Observed":
+    def of_probes(self, probes: BoolArray) -> "Observed":
         """Of some of its probes (probe,)."""
         return replace(
             self,
@@ -178,7 +167,7 @@ class Observed:
             squares += strength**2 * float(np.sum(curve.jitter))
         return math.sqrt(max(squares, 0.0))
 
-    def acting(self, points: Sequence[Point]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    def acting(self, points: Sequence[Point]) -> tuple[IndexArray, FloatArray]:
         """Part of the session (probe,) in which laws leave no more than a share of what they do there, and that: squares (part,).
 
         Of effects that are the same in every frame, or new in each, mean and noise of frames are parts of their own. What is new in
@@ -198,7 +187,7 @@ class Observed:
         ]
         return parts, np.sum(squares, axis=0)
 
-    def power_by_part(self, curve: Curve, strength: float, parts: NDArray[np.intp]) -> NDArray[np.float64]:
+    def power_by_part(self, curve: Curve, strength: float, parts: IndexArray) -> FloatArray:
         """The square of `length` in each of some parts (part,), were the curve (in these units) to move that part and no other.
 
         So a nuisance that parts share brings nothing into those that the curve does not move.
@@ -214,12 +203,12 @@ class Observed:
         return np.maximum(found, 0.0)
 
     @staticmethod
-    def _moved(curve: Curve, strength: float) -> NDArray[np.float64]:
+    def _moved(curve: Curve, strength: float) -> FloatArray:
         """Rows (1 + chance, probe): what a curve's law does at a strength, and what it does by chance."""
         return np.concatenate([curve.response(strength)[None, :], strength * curve.chance.T])
 
 
-def slope(curve: Curve, strength: float) -> NDArray[np.float64]:
+def slope(curve: Curve, strength: float) -> FloatArray:
     """Change (probe,) of a response with the logarithm of the strength."""
     step = 0.02
     above, below = curve.response(strength * math.exp(step)), curve.response(strength * math.exp(-step))

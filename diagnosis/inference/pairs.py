@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
+from ..arrays import FloatArray, IndexArray
 from ..model.curves import Curve
 from .curve_fits import IN_FULL, CurveFit, first_looks, fit_curve, log_integral, log_mean_exp, refined
 from .discrepancy import FARTHEST_LEVEL, LEVELS, at_most_off, leak_below, leak_density, log_frequency, only
@@ -55,26 +55,18 @@ class Pair:
 def weigh_pairs(
     observed: Observed, singles: Mapping[str, Single], *, leading: int, beside: Sequence[Curve] = ()
 ) -> list[Pair]:
-    """The effects that explain most, so many as `leading` says, each with every other one: those that are likely at first sight.
+    """The `leading` effects that explain most, each with every other one: those that are likely at first sight.
 
     Of each of them the pair with its best companion is among these, and so is the pair that explains most if all laws are exact.
-
-    Args:
-        observed: what is weighed.
-        singles: all effects, by id.
-        leading: how many effects are the first of a pair.
-        beside: curves of effects as they respond beside another.
+    beside: curves of effects as they respond beside another.
     """
     if len(singles) < 2:
         return []
 
     def curves(effect: str, other: str) -> list[Curve]:
+        of_effect = [curve for curve in beside if curve.effect == effect]
         own = [fit.curve for fit in singles[effect].fits]
-        return own + [
-            curve
-            for curve in beside
-            if curve.effect == effect and curve.variant.beside is not None and curve.variant.beside.id == other
-        ]
+        return own + [one for one in of_effect if one.variant.beside is not None and one.variant.beside.id == other]
 
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
     seen: dict[tuple[str, str], tuple[float, Point, str]] = {}
@@ -96,19 +88,16 @@ def weigh_pairs(
     start = _together_exactly(observed, singles)
     if start is not None and {start[1].effect, start[2]} not in [{at.effect, other} for _, at, other in starts]:
         starts.append(start)
-    result = []
-    for fit, point, other in starts:
-        first = point.effect
-        both = {first: curves(first, other), other: curves(other, first)}
-        result.append(_settled(observed, fit, point, both, other))
-    return result
+    return [
+        _settled(observed, fit, at, {at.effect: curves(at.effect, other), other: curves(other, at.effect)}, other)
+        for fit, at, other in starts
+    ]
 
 
 def _together_exactly(observed: Observed, singles: Mapping[str, Single]) -> tuple[CurveFit, Point, str] | None:
     """The two effects that explain most together if their laws are exact: fit and place of the one that explains more, and the other.
 
-    Alone, each counts what the other does as its law's error, so that neither need be among those that explain most. Responses are
-    taken as straight in the strength; effects that the twin has, or that only act by chance, take no part.
+    Alone, each counts what the other does as its law's error. Responses are taken as straight in the strength.
     """
     fits = [
         fit
@@ -123,9 +112,8 @@ def _together_exactly(observed: Observed, singles: Mapping[str, Single]) -> tupl
     asked, gram = inner[0, 1:], inner[1:, 1:]
     own = np.maximum(np.diag(gram), 1e-12)
     free = np.maximum(np.outer(own, own) - gram**2, 1e-9 * np.outer(own, own))
-    times = (
-        own[None, :] * asked[:, None] - gram * asked[None, :]
-    ) / free  # how many times its strength each has beside another
+    # how many times its strength each has beside another
+    times = (own[None, :] * asked[:, None] - gram * asked[None, :]) / free
     effects = np.array([fit.curve.effect for fit in fits])
     apart = (effects[:, None] != effects[None, :]) & (times > 0.0) & (times.T > 0.0)
     if not np.any(apart):
@@ -226,20 +214,16 @@ def log_odds_of_leak(observed: Observed, pair: Pair) -> tuple[str, float]:
 def log_odds_of_leak_in(
     observed: Observed,
     second: CurveFit,
-    acting: tuple[NDArray[np.intp], NDArray[np.float64]],
+    acting: tuple[IndexArray, FloatArray],
     levels: Sequence[tuple[float, float]],
     *,
     shape: CurveFit | None = None,
 ) -> float:
     """How much likelier it is that a law leaves an effect's shape than that the effect is there: log of it.
 
-    Args:
-        observed: what is weighed.
-        second: the effect's fit beside that law.
-        acting: parts of the session (probe,), in each of which the law leaves its own share, and how far it moves the probes of each,
-            squared standard deviations (part,).
-        levels: by which it is off, each after its probability.
-        shape: the fit of what such a law could leave of the effect's shape; None: all of it.
+    second: the effect's fit beside that law; acting: parts of the session (probe,), in each of which the law leaves a share, and
+    how far it moves each, squared standard deviations (part,); levels: by which it is off, each after its probability; shape: the fit
+    of what such a law could leave of the effect's shape, None: all of it.
     """
     shape = second if shape is None else shape
     parts, squares = acting
@@ -263,13 +247,7 @@ def log_prior(observed: Observed, point: Point, *, another: bool = False, any_st
 
     Strengths are even in their logarithm. The Gaussian that `Observed.in_presence_of` frees them by is no prior: what it gives is
     subtracted, and the integral over the reach put in its place. About a point, where the likelihood is highest, that falls to both
-    sides, but at an end of the reach.
-
-    Args:
-        observed: what all other effects leave, without this one.
-        point: with strengths as free as it says.
-        another: the effect is only like the curve's.
-        any_strength: that the curve is tried at, none more plausible than another.
+    sides, but at an end of the reach. observed: without this effect; any_strength: none that is tried is more plausible.
     """
     curve, variant = point.curve, point.curve.variant
     slope, curvature = observed.score_and_information(point)

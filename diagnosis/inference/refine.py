@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
 from ...generator.effects.effect import Placement
+from ..arrays import FloatArray
 from ..model.changes import Variant
 from ..model.curves import Curve
 from .curve_fits import CurveFit
@@ -41,16 +41,11 @@ def refine(
     respond: Responder,
     whitening: Whitening,
     blocks: Blocks | None = None,
-) -> list[tuple[Variant, NDArray[np.float64]]]:
+) -> list[tuple[Variant, FloatArray]]:
     """Variants nearer to what was measured than those of the grid, with their responses (strength, probe).
 
-    Args:
-        hypotheses: of the first weighing, with whitened curves.
-        curves: of the grid, whitened.
-        observed: what is weighed, whitened.
-        respond: asks the forward model.
-        whitening: of responses.
-        blocks: of series that share local nuisances; the search asks those that tell most. None: it asks all.
+    Hypotheses of the first weighing, curves of the grid and `observed` are whitened; blocks: of series that share local nuisances, of
+    which the search asks those that tell most (None: all).
     """
     whole = FitTarget(observed=observed, respond=respond, whitening=whitening, blocks=blocks)
     refinement = _Refinement(whole, curves)
@@ -61,15 +56,12 @@ def refine(
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """An effect to be refined: where it is on the grid; of a pair, what stands beside it, and where it is beside that.
+    """An effect to be refined."""
 
-    moves_more: of a pair, that it moves the probes more than the other one; leads: of the first hypothesis.
-    """
-
-    own: Point
-    beside: Point | None = None
-    moves_more: bool = False
-    leads: bool = False
+    own: Point  # where it is on the grid, beside the other of a pair
+    beside: Point | None = None  # of a pair, the other, on the grid
+    moves_more: bool = False  # of a pair, that it moves the probes more than the other
+    leads: bool = False  # of the first hypothesis
 
     @property
     def effect(self) -> str:
@@ -84,7 +76,7 @@ class _Refinement:
         self._whole = whole
         self._curves = curves
         self._closer: dict[str, CurveFit] = {}
-        self.found: list[tuple[Variant, NDArray[np.float64]]] = []
+        self.found: list[tuple[Variant, FloatArray]] = []
 
     def run(self, task: Task) -> None:
         """Refine an effect; one that is not clearly seen, or beside which the other one of its pair is not, is left as it is."""
@@ -149,10 +141,7 @@ def _separation(fit: CurveFit, seen: FitTarget) -> float:
 
 
 def _displaced_and_distorted(fits: Sequence[CurveFit], placement: Placement) -> list[CurveFit]:
-    """A displacement that shifts as the best mere shift does, and enlarges or turns as the best that does so.
-
-    From either alone no small step of the angles leads to the other. Empty: one of them is not seen.
-    """
+    """A displacement that shifts as the best mere shift does, and distorts as the best that does so: no small step leads there."""
     best: dict[bool, tuple[CurveFit, dict[str, float]]] = {}
     for fit in sorted(fits, key=lambda item: item.log_evidence):
         parameters = {**fit.curve.variant.parameters, "strength": fit.best}
@@ -168,10 +157,9 @@ def _displaced_and_distorted(fits: Sequence[CurveFit], placement: Placement) -> 
 
 
 def _starts_of(fits: Sequence[CurveFit], several: bool) -> list[CurveFit]:
-    """The best on the grid, which is not always the one that leads furthest, and another: of the other onset if any is near.
+    """The best on the grid, and another: of the other onset if any is near, else, with `several`, the second best.
 
-    A law as good as exact and one that is off on the grid cannot be weighed against each other: where a share of the
-    evidence speaks for either onset, both are refined. several: the second best, too, where that has the same onset.
+    A law as good as exact and one that is off on the grid cannot be weighed against each other.
     """
     ranked = sorted(fits, key=lambda item: -item.log_evidence)
     if not ranked:
@@ -216,10 +204,7 @@ def tasks_of(hypotheses: Sequence[Hypothesis]) -> list[Task]:
 
 def _within_reach(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """The best known effect or pair, and those that refinement could bring past it, best first; none where no effect helps."""
-    known = sorted(
-        (item for item in hypotheses if item.of_catalogue),
-        key=lambda item: -item.log_evidence,
-    )
+    known = sorted((item for item in hypotheses if item.of_catalogue), key=lambda item: -item.log_evidence)
     # refinement adds some fifth to the evidence of the best on the grid, and far more is needed to be named
     if not known or known[0].log_evidence < ENOUGH:
         return []

@@ -5,9 +5,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS, Parameter
+from ..arrays import FloatArray
 from ..model.changes import Variant
 from ..model.curves import Curve
 from .curve_fits import CurveFit
@@ -15,10 +15,7 @@ from .seen import FitTarget
 
 _CENTRINGS, _CENTRED = 3, 0.15  # times that nodes are laid anew, and logarithm of the strength that needs none
 _ROUNDS = 10  # of a search, at the most: it ends where nothing is gained
-ENOUGH, _ENOUGH_SHARE = (
-    1.0,
-    1e-5,
-)  # gain of log evidence, and share of it, that is worth a search, and another step of one
+ENOUGH, _ENOUGH_SHARE = 1.0, 1e-5  # gain of log evidence, and share of it, that is worth a search or another step
 # share of the gain that straight lines promise, below which slopes are asked anew
 # Source: Nocedal and Wright (2006), Numerical Optimization, algorithm 4.1
 _AS_HOPED = 0.25
@@ -30,7 +27,7 @@ _UP_TO = (0.75, 1.0)  # where more cannot be asked: the spectrum ends a tenth ab
 _ITSELF = (1.0,)  # where the response grows in proportion
 
 
-def searched(start: CurveFit, seen: FitTarget) -> tuple[Variant, NDArray[np.float64]] | None:
+def searched(start: CurveFit, seen: FitTarget) -> tuple[Variant, FloatArray] | None:
     """A variant brought to where the probes want it, with its responses (strength, probe) to all; None: it cannot be asked.
 
     start: from its variant and its best strength; what it does by chance stays.
@@ -54,11 +51,8 @@ def searched(start: CurveFit, seen: FitTarget) -> tuple[Variant, NDArray[np.floa
     return None if found is None else _centred(found, like, seen)
 
 
-def _centred(found: "_Found", like: Curve, seen: FitTarget) -> tuple[Variant, NDArray[np.float64]] | None:
-    """A variant at nodes about the strength that all probes want, with its responses (strength, probe).
-
-    A response that saturates is known near its nodes only: they are laid where the strength turns out to be.
-    """
+def _centred(found: "_Found", like: Curve, seen: FitTarget) -> tuple[Variant, FloatArray] | None:
+    """A variant at nodes about the strength that all probes want, as responses that saturate are known near them only."""
     strength = found.fit.best
     final = _answered(found.variant, strength, seen.respond)
     for _ in range(_CENTRINGS):
@@ -75,10 +69,10 @@ def _centred(found: "_Found", like: Curve, seen: FitTarget) -> tuple[Variant, ND
 def _answered(
     variant: Variant,
     strength: float,
-    respond: Callable[[Sequence[Variant]], Mapping[int, NDArray[np.float64]]],
+    respond: Callable[[Sequence[Variant]], Mapping[int, FloatArray]],
     *,
     nodes: Sequence[Sequence[float]] = (_NEAR, _UP_TO),
-) -> tuple[Variant, NDArray[np.float64]] | None:
+) -> tuple[Variant, FloatArray] | None:
     """A variant at nodes about a strength, the first that can be asked, with its responses (strength, probe); None: none can."""
     for shares in nodes:
         item = variant.refined(variant.parameters, [share * strength for share in shares])
@@ -144,10 +138,7 @@ class _Search:
         return _Found(here, slopes)
 
     def _stepped(self, start: CurveFit, part: Sequence[Parameter], slopes: "Slopes") -> tuple[CurveFit, float]:
-        """The best along a step towards where the probes want some parameters, the start itself where none is better.
-
-        With the log evidence that the whole step would gain were responses straight lines.
-        """
+        """The best along a step of some parameters, else the start, and the log evidence that straight lines promise."""
         steps, hoped = _newton(start, slopes, self._seen)
         here, variant = start, start.curve.variant
         for share in self._shares:
@@ -181,10 +172,10 @@ class Slopes:
     """How a response changes with inner parameters: rows (parameter, probe) for each half of a parameter's range, at one strength."""
 
     names: tuple[str, ...]
-    rows: NDArray[np.float64]
+    rows: FloatArray
     strength: float
 
-    def at(self, strength: float) -> NDArray[np.float64]:
+    def at(self, strength: float) -> FloatArray:
         """The rows at another strength, to which they are taken to be in proportion."""
         return self.rows * (strength / self.strength)
 
@@ -237,8 +228,7 @@ def _plausible(here: CurveFit) -> float:
 def _newton(here: CurveFit, slopes: Slopes, seen: FitTarget) -> tuple[dict[str, float], float]:
     """Steps of the inner parameters, each in half of its range, towards where the probes want them, and what they should gain.
 
-    Least squares in the parameters and the strength together, responses taken as straight lines near here, the law off
-    as usual, each parameter within its range: what one would do beyond its end, the others do otherwise.
+    Least squares in parameters, each within its range, and strength, responses taken as straight lines and the law off as usual.
     """
     strength = _plausible(here)
     at, wide = here.curve.response(strength), seen.widened(here.curve, strength)
@@ -256,9 +246,9 @@ def _newton(here: CurveFit, slopes: Slopes, seen: FitTarget) -> tuple[dict[str, 
     return {name: float(step) for name, step in zip(slopes.names, solved[1:], strict=True)}, gain
 
 
-def _room(variant: Variant, names: Sequence[str]) -> NDArray[np.float64]:
+def _room(variant: Variant, names: Sequence[str]) -> FloatArray:
     """Steps (2, 1 + parameter) of the strength, which is free, and of the inner parameters to the ends of their ranges."""
-    room: NDArray[np.float64] = np.full((2, 1 + len(names)), np.inf)
+    room: FloatArray = np.full((2, 1 + len(names)), np.inf)
     room[0] *= -1.0
     for item in EFFECTS[variant.effect].parameters:
         if item.name in names and not item.goes_round:
@@ -267,7 +257,7 @@ def _room(variant: Variant, names: Sequence[str]) -> NDArray[np.float64]:
     return room
 
 
-def _within(normal: NDArray[np.float64], wanted: NDArray[np.float64], room: NDArray[np.float64]) -> NDArray[np.float64]:
+def _within(normal: FloatArray, wanted: FloatArray, room: FloatArray) -> FloatArray:
     """The x of least x N x / 2 - w x within bounds (2, x)."""
     solved = np.linalg.solve(normal, wanted)
     if np.all((room[0] <= solved) & (solved <= room[1])):

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..model.changes import Variant
 from ..model.curves import Curve
 from .curve_fits import CurveFit, fit_curve
@@ -24,25 +24,20 @@ class Responder(Protocol):
     `wanted` (probe,) says which probes are; others may be 0.
     """
 
-    def __call__(
-        self, asked: Sequence[Variant], /, wanted: NDArray[np.bool_] | None = None
-    ) -> Mapping[int, NDArray[np.float64]]: ...
+    def __call__(self, asked: Sequence[Variant], /, wanted: BoolArray | None = None) -> Mapping[int, FloatArray]: ...
 
 
 @dataclass(frozen=True, slots=True)
 class Blocks:
     """Series that share local nuisances: `of` (probe,) is the block of each probe, `costs` (block,) how long it takes to ask it."""
 
-    of: NDArray[np.intp]
-    costs: NDArray[np.float64]
+    of: IndexArray
+    costs: FloatArray
 
-    def telling(self, tells: NDArray[np.float64]) -> NDArray[np.bool_] | None:
-        """Probes (probe,) of the blocks that tell most for what they cost; None: nearly all are needed.
+    def telling(self, tells: FloatArray) -> BoolArray | None:
+        """Probes (probe,) of the blocks that tell most, by what each probe tells, for what they cost; None: nearly all are needed.
 
         Blocks that cost less than a tenth of the dearest are always among them: they say what nuisances do.
-
-        Args:
-            tells: what each probe tells (probe,).
         """
         of_block = np.maximum(np.bincount(self.of, weights=tells, minlength=len(self.costs)), 0.0)
         kept = self.costs < 0.1 * self.costs.max()
@@ -59,19 +54,14 @@ class Blocks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitTarget:
-    """What one effect is fitted to, beside others, and how the forward model is asked for more of it.
-
-    Its curves are whitened and in the units of the first probes. Fields: observed; respond: the forward model; whitening of its
-    responses; blocks of series (None: all are asked); wanted: which of all probes these are (None: all); level: by which laws are
-    taken to be off.
-    """
+    """What one effect is fitted to, in curves whitened and in the units of the first probes, and how the forward model is asked."""
 
     observed: Observed
     respond: Responder
-    whitening: Whitening
-    blocks: Blocks | None = None
-    wanted: NDArray[np.bool_] | None = None
-    level: float = USUAL_LEVEL
+    whitening: Whitening  # of its responses
+    blocks: Blocks | None = None  # of series; None: all are asked
+    wanted: BoolArray | None = None  # which of all probes these are; None: all
+    level: float = USUAL_LEVEL  # by which laws are taken to be off
 
     def in_presence_of(self, point: Point) -> "FitTarget":
         """The same once another effect stands there."""
@@ -92,11 +82,11 @@ class FitTarget:
         """What is seen where a curve's law is off at a strength."""
         return self.observed.widened(self.observed.scaled(curve), strength, self.level) or self.observed
 
-    def ask(self, variants: Sequence[Variant]) -> dict[int, NDArray[np.float64]]:
+    def ask(self, variants: Sequence[Variant]) -> dict[int, FloatArray]:
         """Responses (strength, probe) of variants by their place, whitened."""
         return {number: self.own(found) for number, found in self.respond(variants, wanted=self.wanted).items()}
 
-    def own(self, responses: NDArray[np.float64]) -> NDArray[np.float64]:
+    def own(self, responses: FloatArray) -> FloatArray:
         """Responses of all probes as the forward model gives them, whitened, of these probes."""
         whitened = self.whitening.apply(responses)
         return whitened if self.wanted is None else whitened[:, self.wanted]

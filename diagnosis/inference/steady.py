@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import FloatArray, IndexArray
 from ..model.curves import Curve
 from .nuisances import Whitening
 
@@ -17,13 +17,8 @@ from .nuisances import Whitening
 class Steady:
     """The part of a curve that steady effects together can do to the mean frames of each beam and scene."""
 
-    def __init__(self, curves: Sequence[Curve], alike: NDArray[np.intp], whitening: Whitening) -> None:
-        """
-        Args:
-            curves: of all effects, not whitened.
-            alike (probe,): the same number for probes of the mean frame in series of one beam and scene; negative for other probes.
-            whitening: of the curves that are asked for.
-        """
+    def __init__(self, curves: Sequence[Curve], alike: IndexArray, whitening: Whitening) -> None:
+        """From curves of all effects, not whitened; alike: number (probe,) of the beam and scene of mean frames, else below 0."""
         self._whitening = whitening
         steady = [curve.responses[-1] for curve in curves if curve.variant.course == "steady"]
         groups = [np.flatnonzero(alike == number) for number in np.unique(alike[alike >= 0])]
@@ -34,7 +29,7 @@ class Steady:
         spread = None if curve.spread is None else self._part(curve.spread.T).T
         return replace(curve, responses=self._part(curve.responses), spread=spread)
 
-    def _part(self, whitened: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _part(self, whitened: FloatArray) -> FloatArray:
         """Vectors (vector, probe), whitened, with what steady effects cannot do left out."""
         vectors = self._whitening.undo(whitened)
         for members, reached in self._parts:
@@ -42,7 +37,7 @@ class Steady:
         return self._whitening.apply(vectors)
 
 
-def _reached(responses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _reached(responses: FloatArray) -> FloatArray:
     """The part (probe, probe) of a vector that a sum of responses (curve, probe) follows, each times a number of variance 1.
 
     The mean of that sum where the vector is seen with noise of a standard deviation in each probe.

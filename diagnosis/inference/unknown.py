@@ -8,9 +8,9 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
+from ..arrays import FloatArray, IndexArray
 from .observed import Observed
 
 SIZES = np.geomspace(0.5, 5000.0, 14)  # standard deviations
@@ -20,15 +20,12 @@ _SWEEPS = 4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Families:
-    """Families of probes: one axis of the series of one kind and scene, or what shows in it that one effect alone can make.
+    """Families of probes: one axis of the series of one kind and scene, or what shows in it that one effect alone can make."""
 
-    Fields: of (probe,): number of each probe's family; names; exact: numbers of those in which one effect alone shows; of_kind:
-    kind of each family's series (empty: several) and axis; nothing where that is not known.
-    """
-
-    of: NDArray[np.intp]
+    of: IndexArray  # (probe,): number of each probe's family
     names: tuple[str, ...]
-    exact: frozenset[int] = frozenset()
+    exact: frozenset[int] = frozenset()  # numbers of those in which one effect alone shows
+    # kind of each family's series (empty: several) and axis; nothing where that is not known
     of_kind: tuple[tuple[str, str], ...] = ()
 
     def reached_by(self, effects: Collection[str]) -> frozenset[int]:
@@ -43,15 +40,11 @@ class Families:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExtraVariance:
-    """What a residual shows beyond what may vary.
+    """What a residual shows beyond what may vary."""
 
-    Fields: log_evidence over none of an unknown effect; place: family of probes in which it is seen most; length: root of the sum of
-    the extra variances of all probes, in standard deviations of the first probes.
-    """
-
-    log_evidence: float
-    place: str
-    length: float
+    log_evidence: float  # over none, of an unknown effect
+    place: str  # family of probes in which it is seen most
+    length: float  # root of the sum of the extra variances of all probes, standard deviations of the first probes
 
 
 def fit_extra_variance(
@@ -86,7 +79,7 @@ def fit_extra_variance(
             weights = 1.0 / (1.0 + tau2)
             weights[g] = 0.0
             without = normal - grams[g] / (1.0 + tau2[g])
-            rest: NDArray[np.float64] = np.asarray(np.linalg.cholesky(without))
+            rest: FloatArray = np.asarray(np.linalg.cholesky(without))
             found = _at_each(1.0 / (1.0 + grid**2), rest, weights @ sums, factors[part], residual[part])
             weights[g] = 1.0
             found += 0.5 * float(sizes @ np.log(weights) - (weights @ squares - squares[g]))
@@ -125,19 +118,12 @@ def _price(shown: int, count: int) -> float:
 
 
 def _at_each(
-    weights: NDArray[np.float64],
-    rest: NDArray[np.float64],
-    vector: NDArray[np.float64],
-    factors: NDArray[np.float64],
-    residual: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    weights: FloatArray, rest: FloatArray, vector: FloatArray, factors: FloatArray, residual: FloatArray
+) -> FloatArray:
     """Log likelihood (weight,) with the probes of one group counting so much, but for a constant that they do not change.
 
-    Args:
-        weights: of these probes, one over their variance (weight,).
-        rest: Cholesky factor of the precision of the nuisances that all others leave (factor, factor).
-        vector: what the others say of the nuisances (factor,).
-        factors, residual: of the group's probes (probe, factor), (probe,).
+    weights: one over these probes' variance (weight,); rest: Cholesky factor of the precision of nuisances that all others leave
+    (factor, factor); vector: what these say of them (factor,); factors (probe, factor) and residual (probe,): of the group.
     """
     from scipy.linalg import solve_triangular
 

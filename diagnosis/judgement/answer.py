@@ -28,23 +28,19 @@ _PLOTTED = 12  # hypotheses, the most probable
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cause:
-    """An effect, how probable it is, its strength and inner parameters, how far the gap shrinks with it, and what its law leaves.
-
-    strength: value, low, high, signed; level: by how much of itself its law seems to be off; series: names of those in which it
-    acts, empty: all since its onset; apart: in each scene of these by an amount of its own.
-    """
+    """An effect, how probable it is, its strength and inner parameters, how far the gap shrinks with it, and what its law leaves."""
 
     effect: str
     probability: float
-    strength: tuple[float, float, float]
+    strength: tuple[float, float, float]  # value, low, high, signed
     unit: str
     parameters: Mapping[str, float]
     since: str
     shrinks_by: tuple[float, float, float] | None
-    level: float = 0.0
+    level: float = 0.0  # by how much of itself its law seems to be off
     left: tuple["Place", ...] = ()
-    series: tuple[str, ...] = ()
-    apart: bool = False
+    series: tuple[str, ...] = ()  # names of those in which it acts; empty: all since its onset
+    apart: bool = False  # in each scene of these by an amount of its own
 
     @property
     def onset(self) -> str | tuple[str, ...]:
@@ -198,13 +194,7 @@ def improved(twin: Twin, added: Sequence[AppliedEffect]) -> Twin:
 
 
 def in_pixels(diagnosis: Diagnosis, *, twin: Twin, factor: int) -> Diagnosis:
-    """A diagnosis made with squares of pixels, in terms of the panel's pixels.
-
-    Args:
-        diagnosis: of the binned session.
-        twin: the panel's own, calibrated from the same series.
-        factor: pixels along each side of a square.
-    """
+    """A diagnosis made with squares of `factor` pixels a side, in terms of the panel's pixels; twin: the panel's own."""
     added = tuple(
         replace(item, parameters=parameters_in_pixels(item.id, item.parameters, factor)) for item in diagnosis.added
     )

@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..inference.discrepancy import USUAL_LEVEL, law_terms
 from ..inference.inference import UNKNOWN, Hypothesis
 from ..inference.nuisances import LocalNuisances
 from ..inference.observed import Point
-from ..problem.problem import Problem, SeriesView
+from ..problem.problem import Problem
+from ..problem.series_block import SeriesView
 from .strengths import points_on
 
 _DRAWS = 300
@@ -22,16 +23,13 @@ MOST = 0.5  # share of the gap above noise, or of the squares of what an explana
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gap:
-    """Root mean square of standardised residuals on held-out probes, 1 = noise: before and after, and the floor.
-
-    tested: most of what is named shows where others tell its strength well enough to remove it.
-    """
+    """Root mean square of standardised residuals on held-out probes, 1 = noise: before and after, and the floor."""
 
     before: float
     after: float
     floor: float
     shrinks_by: tuple[float, float, float] | None
-    tested: bool = True
+    tested: bool = True  # most of what is named shows where others tell its strength well enough to remove it
 
     @property
     def at_floor(self) -> bool:
@@ -51,12 +49,11 @@ class Gap:
         return self.falls and (self.shrinks_by is None or self.shrinks_by[0] > MOST)
 
 
-def folds_of(problem: Problem) -> NDArray[np.intp]:
+def folds_of(problem: Problem) -> IndexArray:
     """Fold 0 or 1 of each series: alternating in time within each kind, sort of object and tube voltage.
 
-    Where that would leave one fold a single exposure of a voltage and the other fold another one (series at two exposures taken
-    by turns), each goes where there are fewer of its exposure and of those that calibrate as it does: no level tells what
-    exposures do, and no gain map what has changed, unless both are there.
+    Where that would leave either fold a single exposure of a voltage, each its own, series go where there are fewer of their exposure
+    and of those that calibrate as they do: what exposures do, and what has changed, shows only where both are there.
     """
     folds = [0] * len(problem.views)
     beams: Counter[tuple[Any, ...]] = Counter()
@@ -92,9 +89,7 @@ def _beam(view: SeriesView) -> tuple[Any, ...]:
     return (series.kind, view.session.request.scene_kind, series.kV if series.kind != "dark" else None)
 
 
-def left_over(
-    problem: Problem, fit: NDArray[np.bool_], added: Sequence[Point] = ()
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def left_over(problem: Problem, fit: BoolArray, added: Sequence[Point] = ()) -> tuple[FloatArray, FloatArray]:
     """What nuisances fitted on `fit` leave of the other probes, in standard deviations of that prediction, and these (probe,).
 
     added: effects and their strengths that are taken off, in place of the base's own; what they do by chance is fitted beside the
@@ -154,15 +149,10 @@ def held_out(
         return Gap(before=1.0, after=1.0, floor=1.0, shrinks_by=None), (), {}
 
     floor = _rms(noise)
-    rows = []
-    for axis in dict.fromkeys(axes):
-        chosen = axes == axis
-        rows.append((str(axis), _rms(before[chosen]), _rms(after[chosen]), _rms(noise[chosen])))
-    shares = {}
-    for effect, values in alone.items():
-        found = shrinkage_of(before, values[known], floor, series, rng)
-        if found is not None:
-            shares[effect] = found
+    chosen = {str(axis): axes == axis for axis in dict.fromkeys(axes)}
+    rows = [(axis, _rms(before[one]), _rms(after[one]), _rms(noise[one])) for axis, one in chosen.items()]
+    found = {effect: shrinkage_of(before, values[known], floor, series, rng) for effect, values in alone.items()}
+    shares = {effect: share for effect, share in found.items() if share is not None}
     gap = Gap(
         before=_rms(before),
         after=_rms(after),
@@ -173,7 +163,7 @@ def held_out(
     return gap, tuple(rows), shares
 
 
-def _power(problem: Problem, leading: Hypothesis) -> NDArray[np.float64]:
+def _power(problem: Problem, leading: Hypothesis) -> FloatArray:
     """How far what is named moves each probe (probe,), by its law and by what it has in common by chance: squared deviations."""
     total = np.zeros(len(problem.residual))
     nuisances = LocalNuisances(problem.factors, problem.blocks)
@@ -183,16 +173,12 @@ def _power(problem: Problem, leading: Hypothesis) -> NDArray[np.float64]:
     return total
 
 
-def _rms(values: NDArray[np.float64]) -> float:
+def _rms(values: FloatArray) -> float:
     return float(math.sqrt(np.mean(values**2))) if values.size else 1.0
 
 
 def shrinkage_of(
-    before: NDArray[np.float64],
-    after: NDArray[np.float64],
-    floor: float,
-    series: NDArray[np.intp],
-    rng: np.random.Generator,
+    before: FloatArray, after: FloatArray, floor: float, series: IndexArray, rng: np.random.Generator
 ) -> tuple[float, float, float] | None:
     """Share of the gap above the floor that is gone, and its 95 % interval, series drawn again; None: no gap above the floor.
 

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.line.twin import Twin
 from ..advice.next_series import best_measurement
 from ..advice.plan import advice_text, best_repeat
+from ..arrays import FloatArray
 from ..inference.curve_fits import CurveFit, fit_effects
 from ..inference.discrepancy import FARTHEST_LEVEL, LEVELS, law_terms
 from ..inference.in_series import in_some_series
@@ -36,11 +36,7 @@ _OF_RENDERING = ("rough edge", "edges,", "outline of", "gain map", "texture")  #
 
 
 def judge(
-    problem: Problem,
-    twin: Twin,
-    *,
-    rng: np.random.Generator,
-    progress: Callable[[str], None] | None = None,
+    problem: Problem, twin: Twin, *, rng: np.random.Generator, progress: Callable[[str], None] | None = None
 ) -> Diagnosis:
     """The answer to an assembled problem."""
     tell = progress or (lambda stage: None)
@@ -84,17 +80,13 @@ def judge(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Weighed:
-    """Hypotheses, most probable first, and what they were weighed with.
+    """Hypotheses, most probable first, and what they were weighed with."""
 
-    Fields: problem, with what was refined; hypotheses; out_of_reach: effects that it could not show, and why; observed, whitened, and
-    the fits of every curve to it.
-    """
-
-    problem: Problem
+    problem: Problem  # with what was refined
     hypotheses: tuple[Hypothesis, ...]
-    out_of_reach: dict[str, str]
-    observed: Observed
-    fits: Sequence[CurveFit]
+    out_of_reach: dict[str, str]  # effects that it could not show, and why
+    observed: Observed  # whitened
+    fits: Sequence[CurveFit]  # of every curve to it
 
 
 def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stage: None) -> Weighed:
@@ -107,8 +99,6 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
         part = in_some_series(observed.conditioned(), of_effect, problem.series_of)
         if part is not None:
             problem = problem.in_series(part.variant, part.series, part.log_prior)
-            more = whitening.curves(problem.curves[len(whitened) :])
-            whitened, fits = (*whitened, *more), [*fits, *fit_effects(observed, more)]
     problem = problem.with_scenes_apart()
     more = whitening.curves(problem.curves[len(whitened) :])
     whitened, fits = (*whitened, *more), [*fits, *fit_effects(observed, more)]
@@ -280,15 +270,9 @@ def _likeliest_known(
 
 
 def _causes(
-    problem: Problem,
-    verdict: Verdict,
-    shares: Mapping[str, tuple[float, float, float] | None],
-    left: tuple[Place, ...],
+    problem: Problem, verdict: Verdict, shares: Mapping[str, tuple[float, float, float] | None], left: tuple[Place, ...]
 ) -> tuple[Cause, ...]:
-    """Effects that are named, tied or not out of the question, most probable first.
-
-    shares: how far each shrinks the gap; left: where what is named leaves most.
-    """
+    """Effects that are named, tied or not out of the question, or whose `shares` of the gap are known, most probable first."""
     marginal = _by_effect(verdict.hypotheses)
     marginal.pop(UNKNOWN, None)
     named = verdict.named
@@ -333,7 +317,7 @@ def _places_left(problem: Problem, leading: Hypothesis) -> tuple[Place, ...]:
     return _places(problem, nuisances.given_others(problem.left_by(leading.points()) / root))
 
 
-def _places(problem: Problem, z: NDArray[np.float64]) -> tuple[Place, ...]:
+def _places(problem: Problem, z: FloatArray) -> tuple[Place, ...]:
     """Probes whose z (probe,), once the nuisances took their part, lies beyond `_threshold`, the farthest first."""
     threshold = _threshold(len(problem.residual))
     return tuple(
@@ -437,10 +421,7 @@ def _out_of_reach(problem: Problem, curves: Sequence[Curve], observed: Observed)
 def _next_measurement(
     problem: Problem, tied: Sequence[Hypothesis], rng: np.random.Generator
 ) -> Mapping[str, Any] | None:
-    """What to measure to distinguish the two likeliest explanations, found from the forward model and its noise.
-
-    A series taken again where that settles it, else the measurement that the session lacks which does.
-    """
+    """What distinguishes the two likeliest explanations: a series taken again where that settles it, else a new one."""
     if len(tied) < 2:
         return None
     first, second = ([item.point(effect) for effect in item.effects] for item in tied[:2])

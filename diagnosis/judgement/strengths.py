@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.frames.conditions import with_conditions
 from ...generator.line.twin import Z95
+from ..arrays import BoolArray
 from ..inference.curve_fits import fit_curve
 from ..inference.discrepancy import USUAL_LEVEL, only
 from ..inference.inference import Hypothesis
@@ -19,7 +19,8 @@ from ..model import changes as scales
 from ..model.curves import Curve
 from ..problem.assemble import map_changes
 from ..problem.output_course import rms_about_mean
-from ..problem.problem import Problem, SeriesView
+from ..problem.problem import Problem
+from ..problem.series_block import SeriesView
 from ..session.even_maps import Map, mean_over
 
 _NODES = 800
@@ -78,10 +79,7 @@ def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[
 
 
 def _off_by(problem: Problem, curve: Curve, strength: float, level: float) -> float:
-    """Relative standard deviation of a strength whose law is off by one factor, of `level`, in each family of probes.
-
-    The strength is their mean, weighed by the squares of what they show: level / sqrt(n), n = (sum w)^2 / sum w^2.
-    """
+    """Relative sd of a strength whose law is off by one factor, of `level`, in each family: level sqrt(sum w^2) / sum w."""
     if level == 0.0:
         return 0.0
     weight = np.bincount(problem.families.of, weights=curve.response(strength) ** 2)
@@ -113,8 +111,7 @@ def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[fl
 def _output_rms(problem: Problem, hypothesis: Hypothesis, output: str) -> tuple[float, float, float] | None:
     """Rms of the output over the lit frames, %, about their mean; None: beside another effect hardly any level is known.
 
-    Slow and fast parts of an output that wanders are no one law, but every frame tells its own level. Levels of the calibrating
-    series went into the twin, so the mean over the session says nothing of the output.
+    Every frame tells its own level. Levels of the calibrating series went into the twin, so their mean says nothing of the output.
     """
     others = hypothesis.points(but=output)
     since = hypothesis.variants[output].variant.since == "calibration"
@@ -137,22 +134,17 @@ def _output_rms(problem: Problem, hypothesis: Hypothesis, output: str) -> tuple[
         lit = [number for number in lit if abs(moved[number]) < _MOST_MOVED]
     if len(lit) < _LEAST_SERIES:
         return None
-    levels, courses, noise = [], [], []
-    for number in lit:
-        view, signal_DN = problem.views[number], signals_DN[number]
-        levels.append(_relative(view, view.residual_DN, fields[number]) - moved[number])
-        courses.append(view.summary.frame_mean_DN / signal_DN)
-        noise.append(noises[number] / signal_DN**2)
-    rms = rms_about_mean(levels, courses, noise)
+    views = problem.views
+    levels = [_relative(views[one], views[one].residual_DN, fields[one]) - moved[one] for one in lit]
+    courses = [views[one].summary.frame_mean_DN / signals_DN[one] for one in lit]
+    rms = rms_about_mean(levels, courses, [noises[one] / signals_DN[one] ** 2 for one in lit])
     return None if rms <= 0.0 else (100.0 * rms, 100.0 * rms, 100.0 * rms)
 
 
 def _map_rms(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:
-    """Rms over the pixels, %, of what later flats have changed by, whatever its structure, and its 95 % interval.
+    """Rms over the pixels, %, of what later flats have changed by, and its 95 % interval; None: it is noise, or cannot be told.
 
-    Noise of the frames is as they show it, that of calibration as the twin has it. What other effects change is subtracted, and
-    counts as far as laws of their kind are off. None: there is no later flat, another effect is read from the same maps, or noise
-    and the usual change of a flat's shape would leave as much.
+    Other effects are subtracted, and count as far as laws of their kind are off.
     """
     others = hypothesis.points(but=effect)
     later = [
@@ -185,10 +177,9 @@ def _map_rms(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[flo
 
 
 def _last_dark(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:
-    """The strength at which the last dark of the longest exposure has its level, and its 95 % interval.
+    """The strength at which the last dark of the longest exposure has its level, and its 95 % interval; None: it cannot be told.
 
-    What had drifted when the calibrating darks were taken is the law's: its inner parameters may lie anywhere in their ranges. None:
-    there is no dark that does not calibrate, or other effects, noise and darks that repeat as they do leave nothing of it.
+    What had drifted when the calibrating darks were taken is the law's, whose inner parameters may lie anywhere in their ranges.
     """
     darks = [
         (view.session.request.exposure_ms, view.session.request.start_s, number)
@@ -230,7 +221,7 @@ def _noise_variance(view: SeriesView) -> Map:
     return np.asarray(view.noise_DN**2 + shown / view.summary.frames, np.float32)
 
 
-def _open_field(view: SeriesView) -> NDArray[np.bool_]:
+def _open_field(view: SeriesView) -> BoolArray:
     """Compared pixels (row, column) that no object covers: behind one its thickness is as uncertain as the output drifts."""
     request = view.session.request
     if not request.thickness_mm:
@@ -243,7 +234,7 @@ def _open_field(view: SeriesView) -> NDArray[np.bool_]:
     return np.asarray(view.mask & ~binary_dilation(covered, iterations=_NEAR_PX))
 
 
-def _relative(view: SeriesView, change_DN: Map, field: NDArray[np.bool_]) -> float:
+def _relative(view: SeriesView, change_DN: Map, field: BoolArray) -> float:
     """Mean of a change over a part of the field (row, column), relative to the signal there."""
     return mean_over(change_DN, field) / mean_over(view.signal_DN, field)
 
@@ -254,7 +245,7 @@ def _noise_of_a_frame(view: SeriesView) -> float:
     return mean_over(view.noise_DN**2, view.mask) * view.summary.frames / max(pixels, 1)
 
 
-def points_on(problem: Problem, leading: Hypothesis, effects: Sequence[str], fit: NDArray[np.bool_]) -> list[Point]:
+def points_on(problem: Problem, leading: Hypothesis, effects: Sequence[str], fit: BoolArray) -> list[Point]:
     """Effects at strengths fitted on part of the probes; with two effects, one after the other, three rounds."""
     points = [leading.point(effect) for effect in effects]
     if not points:

@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...generator.line.twin import LEAST_PIXELS, Twin
+from ..arrays import BoolArray, FloatArray
 from ..probes.fixed_pattern import smooth_part
 from ..session.even_maps import full_size, mean_over
 from ..session.session import SessionSeries
@@ -18,20 +18,15 @@ LEAST_GAIN = 0.05  # of a pixel in use
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibratedDarks:
-    """Darks as the calibrating series show them; the twin's where there are none.
-
-    Fields: twin; weights: of each calibrating dark in the dark of an exposure (ms), by name; means_DN (row, column) and
-    white_DN2 (row, column or 1, 1; of one frame) of the calibrating darks, by name; frames of the calibrating series, copies left
-    out, which say nothing more, by name.
-    """
+    """Darks as the calibrating series show them; the twin's where there are none."""
 
     twin: Twin
-    weights: dict[float, dict[str, float]]
-    means_DN: Mapping[str, NDArray[np.float64]]
-    white_DN2: Mapping[str, NDArray[np.float64]]
-    frames: Mapping[str, int]
+    weights: dict[float, dict[str, float]]  # of each calibrating dark, by name, in the dark of an exposure, ms
+    means_DN: Mapping[str, FloatArray]  # (row, column), by name
+    white_DN2: Mapping[str, FloatArray]  # (row, column or 1, 1), of one frame, by name
+    frames: Mapping[str, int]  # of the calibrating series, copies left out, by name
 
-    def under(self, item: SessionSeries) -> NDArray[np.float64]:
+    def under(self, item: SessionSeries) -> FloatArray:
         """Dark (row, column), DN, that is subtracted from a series; 0 where the series had it subtracted before."""
         if "offset" in item.series.corrected:
             return np.zeros(self.twin.maps.shape)
@@ -50,24 +45,18 @@ class CalibratedDarks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibratedMaps:
-    """Dark and gain map.
-
-    Fields: darks; gain (row, column): what the calibrating flats show over what the smooth model expects; shares: of each
-    calibrating flat in it, by name (none: the twin's gain map); beams (row, column): what the twin's flats of a series' beam
-    show over that map, smooth, by name of series, where it stands in; gain_quantum, gain_white: relative variance of one pixel's
-    gain, correlated as quanta are, and white; gain_darks: change of the gain, 1/DN, when a calibrating dark is brighter, by
-    name: what is subtracted from a series as bright as the calibrating flats was subtracted from these as well; good (row,
-    column): pixels in use.
-    """
+    """Dark and gain map."""
 
     darks: CalibratedDarks
-    gain: NDArray[np.float64]
-    shares: dict[str, float]
-    beams: Mapping[str, NDArray[np.float64]]
-    gain_quantum: float
-    gain_white: float
+    gain: FloatArray  # (row, column): what the calibrating flats show over what the smooth model expects
+    shares: dict[str, float]  # of each calibrating flat in it, by name; none: the twin's gain map
+    # (row, column): twin's flats of a series' beam over that map, smooth, by name, where it stands in
+    beams: Mapping[str, FloatArray]
+    gain_quantum: float  # relative variance of one pixel's gain, correlated as quanta are
+    gain_white: float  # the same, white
+    # change of the gain, 1/DN, when a calibrating dark, subtracted from the flats, is brighter, by name
     gain_darks: Mapping[str, float]
-    good: NDArray[np.bool_]
+    good: BoolArray  # (row, column): pixels in use
 
     @property
     def read_DN2(self) -> float | None:
@@ -75,7 +64,7 @@ class CalibratedMaps:
         known = [mean_over(white_DN2, self.good) for white_DN2 in self.darks.white_DN2.values()]
         return sum(known) / len(known) if known else None
 
-    def dark_noise(self, item: SessionSeries, signal_DN: NDArray[np.float64]) -> NDArray[np.float64]:
+    def dark_noise(self, item: SessionSeries, signal_DN: FloatArray) -> FloatArray:
         """Variance, DN^2, that noise of darks gives a pixel of a corrected mean frame; of calibrating ones through the gain map too.
 
         signal_DN: of the series, of any shape, which the result has.
@@ -94,7 +83,7 @@ class CalibratedMaps:
                 total += (own + divisor * signal_DN) ** 2 * variance
         return total
 
-    def corrected(self, item: SessionSeries, mean_DN: NDArray[np.float64]) -> NDArray[np.float64]:
+    def corrected(self, item: SessionSeries, mean_DN: FloatArray) -> FloatArray:
         """A series' mean frame (row, column) less the dark and over the gain map, DN."""
         measured = mean_DN - self.darks.under(item)
         if item.request.beam_on and "gain" not in item.series.corrected:
@@ -109,13 +98,8 @@ def exposure_of(item: SessionSeries) -> float:
     return item.series.exposure_ms or 0.0
 
 
-def calibrated_maps(seen: Sequence[SeenSeries], *, twin: Twin, good: NDArray[np.bool_]) -> CalibratedMaps:
-    """Dark and gain map from the calibrating series among those that can be compared.
-
-    Args:
-        seen: series that can be compared.
-        twin: calibrated; its own maps stand in where no series calibrates.
-        good: pixels that are not known to be bad (row, column).
+def calibrated_maps(seen: Sequence[SeenSeries], *, twin: Twin, good: BoolArray) -> CalibratedMaps:
+    """Dark and gain map from the calibrating series among those seen, the twin's own where none calibrates; good (row, column).
 
     Raises:
         InputError: next to no pixel sees light.
@@ -166,7 +150,7 @@ def calibrated_maps(seen: Sequence[SeenSeries], *, twin: Twin, good: NDArray[np.
     )
 
 
-def _flat_shares(flats: Sequence[SeenSeries], good: NDArray[np.bool_]) -> dict[str, float]:
+def _flat_shares(flats: Sequence[SeenSeries], good: BoolArray) -> dict[str, float]:
     """Share of each calibrating flat in the gain map: as its signal-to-noise ratio squared."""
     weights = {}
     for one in flats:
@@ -194,17 +178,13 @@ def _dark_weights(darks: Sequence[SeenSeries], exposure_ms: float) -> dict[str, 
     return dict(zip(names, weights.tolist(), strict=True))
 
 
-def _gain_of_twin(twin: Twin) -> NDArray[np.float64]:
+def _gain_of_twin(twin: Twin) -> FloatArray:
     shapes = [level.flat_shape for level in twin.levels]
     return np.asarray(np.mean(np.stack(shapes), axis=0) if shapes else twin.maps.gain_relative, dtype=np.float64)
 
 
 def _gain_noise_of_twin(twin: Twin) -> tuple[float, float]:
-    """Relative variance of one pixel of `_gain_of_twin` by noise: of quanta, and white.
-
-    Raises:
-        InputError: a flat does not say of how many exposures it is the mean, or at which signal.
-    """
+    """Relative variance of one pixel of `_gain_of_twin` by noise: of quanta, and white; raises where a flat does not tell it."""
     quantum = white = 0.0
     for level in twin.levels:
         if not level.signal_DN or not level.exposures:
@@ -223,13 +203,13 @@ def _gain_noise_of_twin(twin: Twin) -> tuple[float, float]:
 
 
 def _beams_of_twin(
-    twin: Twin, kept: Sequence[SessionSeries], gain: NDArray[np.float64], good: NDArray[np.bool_]
-) -> dict[str, NDArray[np.float64]]:
+    twin: Twin, kept: Sequence[SessionSeries], gain: FloatArray, good: BoolArray
+) -> dict[str, FloatArray]:
     """Smooth shape (row, column) of the twin's flats of each lit series' beam over its gain map: a heel differs from beam to beam."""
     if len(twin.levels) < 2:
         return {}
     in_use = good & (gain > LEAST_GAIN)
-    shapes: dict[str, NDArray[np.float64]] = {}
+    shapes: dict[str, FloatArray] = {}
     beams = {}
     for item in kept:
         level = twin.level_nearest(item.request.setting) if item.request.beam_on else None

@@ -26,6 +26,7 @@ from ...generator.effects.effect import Displacement, Parameter, Placement
 from ...generator.line.series_request import SeriesRequest
 from ...generator.line.spectral_signal import THRESHOLD
 from ...generator.line.twin import Estimate, SpectralPosterior, SpreadEstimate, Twin
+from ..arrays import FloatArray, RealArray
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS
 from ..probes.tile_seams import SeenSeams
 from ..session.binning import per_bin
@@ -68,10 +69,8 @@ SHAPE_ORDER = 4  # of the polynomials that stand for it, each order half as like
 LINE_NOISE_LIMIT = 0.1  # rms of row and of column offsets over the read noise
 READ_NOISE_SD = (
     LINE_NOISE_LIMIT**2
-)  # rows and columns of that size add twice it to the variance; calibration may leave them out
-OUTPUT_STEP_LIMIT = 0.0005 / math.sqrt(
-    8.0
-)  # rms of an output with 1/f noise of 0.05 % over 16 octaves: two octaves of it
+)  # lines of that size add twice it to the variance, and calibration may leave them out
+OUTPUT_STEP_LIMIT = 0.0005 / math.sqrt(8.0)  # rms of two of 16 octaves of an output with 1/f noise of 0.05 %
 DUST_LIMIT = 0.01  # of the light: a pixel that differs less from its neighbours is no bad one (ASTM E2597)
 FEW_BAD_PIXELS, FEW_BAD_SHARE = 2, 2e-4  # pixels that turn bad in a session: two, or that share of a large panel's
 # of level and gradient where frames were divided by an open field of another time: output, kV, filters and heel may differ
@@ -87,32 +86,24 @@ EACH_SCENE = "each scene by itself"  # where an effect acts that displaces each 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Variant:
-    """An effect with its inner parameters fixed.
-
-    Fields: effect; name; parameters (without the strength); sign (of the strength); since; low, high: plausible range of
-    the strength; strengths > 0, ascending, at which the response is computed; fitted: its inner parameters with their ranges here;
-    refined_from: name of the variant that was refined to be this one, None: not refined; series: names of those in which it acts
-    (empty: all); log_prior: log probability of that, against one that acts in all; most: strength beyond which there is nothing (a
-    share of 100 %); apart: it displaces each scene by an amount of its own, by chance; beside: another effect that is there: its
-    response is what it adds to that one's; course: what the effect is from frame to frame, as `Effect` says (empty: not known).
-    """
+    """An effect with its inner parameters fixed."""
 
     effect: str
     name: str = ""
-    parameters: Mapping[str, float] = field(default_factory=dict)
-    sign: float = 1.0
+    parameters: Mapping[str, float] = field(default_factory=dict)  # without the strength
+    sign: float = 1.0  # of the strength
     since: str = "always"
-    low: float
+    low: float  # with high: plausible range of the strength
     high: float
-    strengths: tuple[float, ...]
-    fitted: tuple[Parameter, ...] = ()
-    refined_from: str | None = None
-    series: tuple[str, ...] = ()
-    log_prior: float = 0.0
-    most: float = math.inf
-    apart: bool = False
-    beside: AppliedEffect | None = None
-    course: str = ""
+    strengths: tuple[float, ...]  # > 0, ascending, at which the response is computed
+    fitted: tuple[Parameter, ...] = ()  # its inner parameters with their ranges here
+    refined_from: str | None = None  # name of the variant that was refined to be this one; None: not refined
+    series: tuple[str, ...] = ()  # in which it acts, by name; empty: all
+    log_prior: float = 0.0  # log probability of that, against one that acts in all
+    most: float = math.inf  # strength beyond which there is nothing (a share of 100 %)
+    apart: bool = False  # it displaces each scene by an amount of its own, by chance
+    beside: AppliedEffect | None = None  # another effect that is there: the response is added to that one's
+    course: str = ""  # what the effect is from frame to frame, as `Effect` says; empty: not known
 
     def refined(self, parameters: Mapping[str, float], strengths: Sequence[float]) -> "Variant":
         """The same with other inner parameters, asked at other strengths; its name says where it came from."""
@@ -129,29 +120,21 @@ class Variant:
 
     def applied(self, strength: float) -> AppliedEffect:
         """The effect at a strength, as the forward model takes it."""
-        return AppliedEffect(
-            id=self.effect,
-            parameters={**self.parameters, "strength": self.sign * strength},
-            since=self.since,
-        )
+        parameters = {**self.parameters, "strength": self.sign * strength}
+        return AppliedEffect(id=self.effect, parameters=parameters, since=self.since)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Change:
-    """A change asked of the forward model.
+    """A change asked of the forward model."""
 
-    Fields: label: effect or nuisance; twin; effects, besides those that the twin has; instead_of: effects of the base twin that this
-    one has not; parameters (parameter,) of the spectrum in place of the best ones; step_sd: size of a nuisance's step in prior
-    standard deviations; steps: series that a step of the twin moves, "all", "lit" or none.
-    """
-
-    label: str
+    label: str  # effect or nuisance
     twin: Twin
-    effects: tuple[AppliedEffect, ...] = ()
-    instead_of: tuple[AppliedEffect, ...] = ()
-    parameters: NDArray[np.float64] | None = None
-    step_sd: float = 1.0
-    steps: str = ""
+    effects: tuple[AppliedEffect, ...] = ()  # besides those that the twin has
+    instead_of: tuple[AppliedEffect, ...] = ()  # effects of the base twin that this one has not
+    parameters: FloatArray | None = None  # (parameter,) of the spectrum in place of the best ones
+    step_sd: float = 1.0  # size of a nuisance's step in prior standard deviations
+    steps: str = ""  # series that a step of the twin moves, "all", "lit" or none
 
     def touches(self, request: SeriesRequest) -> bool:
         """Whether the change can show in a series."""
@@ -248,11 +231,8 @@ class _Misplaced:
 def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
     """The variants of an effect that compete: ends and middle of each inner parameter, both signs, both onsets.
 
-    side: of the squares of the panel's pixels that frames have for pixels; lengths in pixels and what is counted by pixel
-    are those of the panel.
-
-    What calibration takes in whole (a constant kV offset, filtration, gain map, more noise) is no gap and is tried as setting in
-    after it; what acts on objects alone is the same either way; the rest is tried both ways.
+    side: of the squares of the panel's pixels that frames have for pixels. What calibration takes in whole (a constant kV offset,
+    filtration, gain map, more noise) is tried as setting in after it; what acts on objects alone is the same either way.
     """
     strength, *others = (per_bin(item, side) for item in effect.parameters)
     inner = [item for item in others if item.fitted]
@@ -317,7 +297,16 @@ def with_pauses(variants: Sequence[Variant], *, stated: bool) -> list[Variant]:
         grown = [variant]
         for item in EFFECTS[variant.effect].parameters:
             if item.tried_without_times and item.name not in variant.parameters:
-                grown = [_with_tried(one, item, value) for one in grown for value in item.tried_without_times]
+                grown = [
+                    replace(
+                        one,
+                        name=f"{one.name}, {item.name} {value:g}",
+                        parameters={**one.parameters, item.name: value},
+                        fitted=(*one.fitted, item),
+                    )
+                    for one in grown
+                    for value in item.tried_without_times
+                ]
         result += grown
     return result
 
@@ -334,23 +323,10 @@ def with_seams(variants: Sequence[Variant], seen: SeenSeams | None) -> list[Vari
         elif seen is None:
             result.append(replace(variant, parameters={**variant.parameters, "rows_px": 0.0, "columns_px": 0.0}))
         elif seen.any:
-            places = {
-                f"{start}{axis}_px": value
-                for axis, seams in (("rows", seen.rows), ("columns", seen.columns))
-                for start, value in (("", seams.side_px), ("first_", seams.first_px))
-            }
+            places = {"rows_px": seen.rows.side_px, "first_rows_px": seen.rows.first_px}
+            places |= {"columns_px": seen.columns.side_px, "first_columns_px": seen.columns.first_px}
             result.append(replace(variant, parameters={**variant.parameters, **places}, log_prior=seen.log_prior))
     return result
-
-
-def _with_tried(variant: Variant, item: Parameter, value: float) -> Variant:
-    """The variant with one more inner parameter, from a value."""
-    return replace(
-        variant,
-        name=f"{variant.name}, {item.name} {value:g}",
-        parameters={**variant.parameters, item.name: value},
-        fitted=(*variant.fitted, item),
-    )
 
 
 def catalogue_variants(*, without: Sequence[str] = (), side: int = 1) -> list[Variant]:
@@ -359,7 +335,7 @@ def catalogue_variants(*, without: Sequence[str] = (), side: int = 1) -> list[Va
     return [variant for effect in kept for variant in variants_of(effect, side=side)]
 
 
-def spectral_sds(posterior: SpectralPosterior) -> NDArray[np.float64]:
+def spectral_sds(posterior: SpectralPosterior) -> FloatArray:
     """Standard deviations (parameter,) that spectral parameters are taken to have before a session is seen.
 
     They are those that calibration started from, not its posterior's: the calibrating series are among the probes and say again
@@ -398,9 +374,7 @@ def departures_found(posterior: SpectralPosterior | None) -> float:
 def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[Change]:
     """Steps in what calibration has fitted, each with the step's size in prior standard deviations (`spectral_sds`).
 
-    Args:
-        twin: as asked.
-        spectral_steps: size of a step over the posterior's standard deviation.
+    spectral_steps: size of a step over the posterior's standard deviation.
     """
     noise, spread, read = twin.noise, twin.noise.spread, twin.noise.read_noise_DN
 
@@ -475,8 +449,7 @@ def always_a_little(*, side: int = 1) -> list[Variant]:
     """What most lines have of some effects, at one prior standard deviation: tails of the spread."""
     result = []
     for effect in EFFECTS.values():
-        little = effect.always_a_little
-        if little is None:
+        if (little := effect.always_a_little) is None:
             continue
         some = variants_of(effect, side=side)[0]
         for inner, strength in little.amounts:
@@ -496,7 +469,7 @@ def smooth_twin(twin: Twin) -> Twin:
     maps = twin.maps
     good = maps.bad_pixels == 0
 
-    def level(image: NDArray[np.floating]) -> NDArray[np.float32]:
+    def level(image: RealArray) -> NDArray[np.float32]:
         return np.full(maps.shape, float(np.median(image[good])) if good.any() else float(np.median(image)), np.float32)
 
     flat = np.ones(maps.shape, np.float32)

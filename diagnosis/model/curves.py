@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from itertools import accumulate
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import BoolArray, FloatArray
 from . import _node_loops
 from .changes import Variant
 
@@ -19,20 +19,18 @@ _BEYOND_NODES = 1.5  # times above the last strength that was asked, elsewhere
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Curve:
-    """Response of the probes to one variant of an effect.
+    """Response of the probes to one variant of an effect, 0 at strength 0.
 
-    Fields: variant; responses (node, probe): m_e at the variant's strengths, standardised as the probes are; 0 at strength 0; spread
-    (probe, factor): random responses a unit of strength that come with the effect (a drifting output shifts each series' level by
-    chance); jitter (probe,): variance a unit of strength squared that it gives each probe by itself (a gain map that changed pixel
-    by pixel); exact (probe,): probes that the strength is defined by, in which no law can be far off.
     Between nodes and zero the response is interpolated (Lagrange through the four nearest points, 0 one of them).
     """
 
     variant: Variant
-    responses: NDArray[np.float64]
-    spread: NDArray[np.float64] | None = None
-    jitter: NDArray[np.float64] | None = None
-    exact: NDArray[np.bool_] | None = None
+    responses: FloatArray  # (node, probe): at the variant's strengths, standardised as the probes are
+    # (probe, factor): random responses a unit of strength, as a drifting output shifts each series' level
+    spread: FloatArray | None = None
+    # (probe,): variance a unit of strength squared of each probe by itself, as of a gain map that changed pixel by pixel
+    jitter: FloatArray | None = None
+    exact: BoolArray | None = None  # (probe,): probes that the strength is defined by, in which no law can be far off
 
     @property
     def effect(self) -> str:
@@ -40,7 +38,7 @@ class Curve:
         return self.variant.effect
 
     @property
-    def strengths(self) -> NDArray[np.float64]:
+    def strengths(self) -> FloatArray:
         """Strengths (node,) of the responses."""
         return np.array(self.variant.strengths)
 
@@ -53,13 +51,13 @@ class Curve:
             highest = _BEYOND_NODES * max(own.high, own.strengths[-1])
         return own.low / _WEAKER, min(highest, own.most)
 
-    def log_strengths(self) -> NDArray[np.float64]:
+    def log_strengths(self) -> FloatArray:
         """Strengths at which integrals are taken: evenly in the logarithm over the reach, and the ends of the plausible range."""
         ends = np.array([self.variant.low, self.variant.high])
         return np.unique(np.concatenate([np.geomspace(*self.reach, STRENGTH_NODES), ends]))
 
     @property
-    def chance(self) -> NDArray[np.float64]:
+    def chance(self) -> FloatArray:
         """What the effect does by chance (probe, factor), a unit of strength: its spread, of no factor where it has none."""
         return np.zeros((self.responses.shape[1], 0)) if self.spread is None else self.spread
 
@@ -68,15 +66,15 @@ class Curve:
         """Whether the effect moves no probe by a known amount, but some by chance."""
         return self.spread is not None and not bool(np.any(np.abs(self.responses) > LEAST_RESPONSE))
 
-    def weights(self, strength: NDArray[np.float64]) -> NDArray[np.float64]:
+    def weights(self, strength: FloatArray) -> FloatArray:
         """Weights (strength, node) with which the nodes' responses add up at given strengths."""
         return node_weights(self.strengths, np.atleast_1d(np.asarray(strength, dtype=np.float64)))
 
-    def response(self, strength: float) -> NDArray[np.float64]:
+    def response(self, strength: float) -> FloatArray:
         """Response (probe,) at one strength."""
         return np.asarray(self.weights(np.array([strength]))[0] @ self.responses)
 
-    def of_probes(self, probes: NDArray[np.bool_]) -> "Curve":
+    def of_probes(self, probes: BoolArray) -> "Curve":
         """The curve of some of its probes (probe,)."""
         return replace(
             self,
@@ -86,7 +84,7 @@ class Curve:
             exact=None if self.exact is None else self.exact[probes],
         )
 
-    def over(self, root: NDArray[np.float64]) -> "Curve":
+    def over(self, root: FloatArray) -> "Curve":
         """The curve of probes whose standard deviations are `root` (probe,) times as large."""
         return replace(
             self,
@@ -102,6 +100,6 @@ def places_of(parts: Sequence[Sized]) -> list[slice]:
     return [slice(stop - len(part), stop) for part, stop in zip(parts, stops, strict=True)]
 
 
-def node_weights(nodes: NDArray[np.float64], strengths: NDArray[np.float64]) -> NDArray[np.float64]:
+def node_weights(nodes: FloatArray, strengths: FloatArray) -> FloatArray:
     """Weights (strength, node) with which responses at nodes > 0 add up: Lagrange through the four nearest of 0 and nodes."""
     return np.asarray(_node_loops.node_weights(nodes, strengths))

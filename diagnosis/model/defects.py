@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import BoolArray, FloatArray, RealArray
 from ..probes.fixed_pattern import smooth_part
 from ..probes.lasting import OUTLYING, lasting_pixels
 from ..session.even_maps import NEIGHBOURS_PX, near_steps, signal_map
@@ -27,17 +27,14 @@ _MOST_OUTLYING = 0.1  # share of the pixels; more of them are a pattern
 class StandingOut:
     """Pixels (row, column) in use that stand out: `bad` ones, and `any`, with those that dust would explain (1 % of the light)."""
 
-    bad: NDArray[np.bool_]
-    any: NDArray[np.bool_]
+    bad: BoolArray
+    any: BoolArray
 
 
 def new_outliers(seen: Sequence[SeenSeries], maps: CalibratedMaps, *, counting: bool) -> StandingOut:
     """Pixels in use that stand out in any dark or flat, or in all objects from some time on.
 
-    Args:
-        seen: series that can be compared.
-        maps: dark and gain map of the calibrating series.
-        counting: the detector counts quanta; of others, numbers that stand still say how far a pixel is from the ADC's next step.
+    Unless the detector counts quanta, numbers that stand still say how far a pixel is from the next step of the ADC.
     """
     good, shape = maps.good, maps.good.shape
     outlying, dusty = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
@@ -72,7 +69,7 @@ def new_outliers(seen: Sequence[SeenSeries], maps: CalibratedMaps, *, counting: 
     return StandingOut(bad=bad, any=all_of_them | bad)
 
 
-def _without_areas(outlying: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _without_areas(outlying: BoolArray) -> BoolArray:
     """Pixels (row, column) that stand out, less areas of them as large as a block: a tile or a mark of the screen is a pattern."""
     from scipy.ndimage import maximum_filter, uniform_filter
 
@@ -80,11 +77,8 @@ def _without_areas(outlying: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(outlying & ~maximum_filter(whole, BLOCK_PX), dtype=bool)
 
 
-def _out_in_every_object(seen: Sequence[SeenSeries], maps: CalibratedMaps) -> NDArray[np.bool_]:
-    """Pixels that stand out of their neighbours whatever lies before them, from some time on: no dark or flat need follow.
-
-    A view in which a step of the object passes by a pixel tells nothing of it.
-    """
+def _out_in_every_object(seen: Sequence[SeenSeries], maps: CalibratedMaps) -> BoolArray:
+    """Pixels that stand out of their neighbours in nearly all later views, of several scenes, in which no step passes by them."""
     from scipy.ndimage import median_filter
 
     good = maps.good
@@ -97,7 +91,7 @@ def _out_in_every_object(seen: Sequence[SeenSeries], maps: CalibratedMaps) -> ND
     found = np.zeros(good.shape, dtype=bool)
     for members in alike.values():
         times, views = np.zeros(good.shape), np.zeros(good.shape)
-        seen_in: dict[str, NDArray[np.bool_]] = {}
+        seen_in: dict[str, BoolArray] = {}
         for one in reversed(members):
             measured = maps.corrected(one.session, one.look.mean_DN)
             signal = signal_map(one.expected, good.shape)
@@ -114,7 +108,7 @@ def _out_in_every_object(seen: Sequence[SeenSeries], maps: CalibratedMaps) -> ND
     return found
 
 
-def _of_lines(ratio: NDArray[np.floating], good: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _of_lines(ratio: RealArray, good: BoolArray) -> FloatArray:
     """Median of a map (row, column) of 1 as a rule along each pixel's row or column, the larger: noise that a line has in common."""
     known = np.where(good, np.asarray(ratio, dtype=np.float64), 1.0)
     rows, columns = (np.median(known, axis=axis, keepdims=True) for axis in (1, 0))
@@ -131,7 +125,7 @@ def _largest_ratio(frames: int) -> float:
     return float(2.0 * gammainccinv(0.5 * freedom, 1e-7) / freedom)
 
 
-def lasting_anywhere(seen: Sequence[SeenSeries], good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def lasting_anywhere(seen: Sequence[SeenSeries], good: BoolArray) -> BoolArray:
     """Good pixels (row, column) whose level lasts for some frames in any later dark."""
     found = np.zeros(good.shape, dtype=bool)
     for one in seen:
@@ -143,7 +137,7 @@ def lasting_anywhere(seen: Sequence[SeenSeries], good: NDArray[np.bool_]) -> NDA
     return found
 
 
-def memory_of(look: FirstLook, outlying: NDArray[np.bool_]) -> tuple[float, int] | None:
+def memory_of(look: FirstLook, outlying: BoolArray) -> tuple[float, int] | None:
     """Median share of outlying pixels' variance that lasts from frame to frame, and their number; None: none is noisy."""
     stack, pair = look.stack_variance_DN2[outlying], look.pair_variance_DN2[outlying]
     seen = stack > 0

@@ -3,16 +3,13 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ...errors import InputError
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.frames.conditions import with_conditions
 from ...generator.frames.line_model import ExpectedSeries, LineModel
 from ...generator.frames.model_cache import ModelCache
 from ...generator.line.series_request import SeriesRequest
 from ...generator.line.twin import Twin
+from ..arrays import FloatArray
 from ..probes.registration import SHARP_PX
 from ..session.session import SessionSeries
 from .changes import OF_BEAMS_GROWS, Change, Variant, departures_found
@@ -29,17 +26,12 @@ def draft_cache() -> ModelCache:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForwardModel:
-    """The base twin as the series of a session ask it.
+    """The base twin as the series of a session ask it."""
 
-    Fields: base: the twin with all pixels alike, and the effects that it has; conditions of the session that effects know;
-    own_maps: flats of the session make the gain map, so that these, too, are asked for what was always there;
-    cache, filled by asking.
-    """
-
-    base: Twin
-    conditions: dict[str, float]
-    own_maps: bool = True
-    cache: ModelCache = field(default_factory=draft_cache)
+    base: Twin  # with all pixels alike, and the effects that it has
+    conditions: dict[str, float]  # of the session, that effects know
+    own_maps: bool = True  # flats of the session make the gain map, and are asked for what was always there
+    cache: ModelCache = field(default_factory=draft_cache)  # filled by asking
 
     @property
     def sharp(self) -> bool:
@@ -81,31 +73,12 @@ class ForwardModel:
         return down - base_down, right - base_right
 
     def expect(self, request: SeriesRequest) -> ExpectedSeries:
-        """The series as the base twin expects it.
-
-        Raises:
-            InputError: the twin knows too little for it.
-        """
+        """The series as the base twin expects it; raises as `under`."""
         return self.under(self.unchanged, request)
 
     def expect_changed(self, request: SeriesRequest, change: Change, unchanged: ExpectedSeries) -> ExpectedSeries:
-        """The series under a change: `unchanged` itself where the change cannot show.
-
-        Raises:
-            InputError: the twin knows too little for it.
-        """
+        """The series under a change: `unchanged` itself where the change cannot show; raises as `under`."""
         return self.under(change, request) if change.touches(request) else unchanged
-
-    def expect_all(self, items: Sequence[SessionSeries]) -> tuple[dict[str, ExpectedSeries], list[str]]:
-        """The series as the base twin expects them, by name, and why others cannot be."""
-        expected: dict[str, ExpectedSeries] = {}
-        refused: list[str] = []
-        for item in items:
-            try:
-                expected[item.name] = self.expect(item.request)
-            except InputError as error:
-                refused.append(f"{item.name}: {error}")
-        return expected, refused
 
     def under(self, change: Change, request: SeriesRequest) -> ExpectedSeries:
         """A series under a change, whether that can show there or not.
@@ -116,12 +89,8 @@ class ForwardModel:
         line, shown = self._line(change, request)
         return line.expect(shown)
 
-    def from_beyond(self, change: Change, request: SeriesRequest) -> NDArray[np.float64]:
-        """What the surroundings would let into the field of a series under a change, see `LineModel.from_beyond`.
-
-        Raises:
-            InputError: the twin knows too little for it.
-        """
+    def from_beyond(self, change: Change, request: SeriesRequest) -> FloatArray:
+        """What surroundings would let into the field of a series under a change, see `LineModel.from_beyond`; raises as `under`."""
         line, shown = self._line(change, request)
         return line.from_beyond(shown)
 

@@ -5,10 +5,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.series_request import SeriesRequest
+from ..arrays import BoolArray, FloatArray, RealArray
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, Scalar
 from ..probes.registration import (
     ANYWHERE_SD_PX,
@@ -27,7 +27,7 @@ from ..session.usable import SeenSeries
 from . import changes as scales
 
 SHARP_SCENES = ("edge", "disc")  # drawn true to their outline; steps of wedges and products only to their maps' pixels
-_Blur = Callable[[Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float64]]]
+_Blur = Callable[[Sequence[FloatArray]], Sequence[FloatArray]]
 _PLACEMENTS = 2  # rounds in which a scene is drawn where it was found to lie
 _CLOSER = 0.5  # of the displacement: what a round may add to it
 # an edge that is smeared over many pixels: lengths of boxes along the belt, and standard deviations, px; a wedge that moved by 15 px
@@ -39,51 +39,42 @@ _SMEARED, _SMEARED_SIZES = 0.7, 3  # share of what is left that one of so many b
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlacedSeries:
-    """Series with their scenes drawn where they were found.
+    """Series with their scenes drawn where they were found."""
 
-    Fields: seen, in order of time, requests displaced; placements: of series whose scene was found, by name; telling: of each of
-    these, the one of its place that tells the displacement.
-    """
-
-    seen: tuple[SeenSeries, ...]
-    placements: Mapping[str, Placement]
-    telling: Mapping[str, SeriesRequest]
+    seen: tuple[SeenSeries, ...]  # in order of time, requests displaced
+    placements: Mapping[str, Placement]  # of series whose scene was found, by name
+    telling: Mapping[str, SeriesRequest]  # of each of these, the one of its place that tells the displacement
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredScenes:
-    """What scenes are placed by.
+    """What scenes are placed by."""
 
-    Fields: pictures: corrected mean frames (row, column), DN, by name of series; clean: pixels in use that do not stand out (row,
-    column); sharp: pixels see no farther than themselves; expect: asks the base twin.
-    """
+    pictures: Mapping[str, FloatArray]  # corrected mean frames (row, column), DN, by name of series
+    clean: BoolArray  # (row, column): pixels in use that do not stand out
+    sharp: bool  # pixels see no farther than themselves
+    expect: Callable[[SeriesRequest], ExpectedSeries]  # asks the base twin
 
-    pictures: Mapping[str, NDArray[np.float64]]
-    clean: NDArray[np.bool_]
-    sharp: bool
-    expect: Callable[[SeriesRequest], ExpectedSeries]
-
-    def of(self, members: Sequence[SeenSeries]) -> list[NDArray[np.float64]]:
+    def of(self, members: Sequence[SeenSeries]) -> list[FloatArray]:
         """Measured pictures of some series."""
         return [self.pictures[one.name] for one in members]
 
-    def drawn(self, members: Sequence[SeenSeries], at: tuple[float, float]) -> list[NDArray[np.float64]]:
+    def drawn(self, members: Sequence[SeenSeries], at: tuple[float, float]) -> list[FloatArray]:
         """Their pictures by the base twin with the scene displaced along rows and columns, px."""
         asked = [replace(one.session.request, displacement_px=at) for one in members]
         return [signal_map(self.expect(request), self.clean.shape) for request in asked]
 
 
 def place_scenes(seen: Sequence[SeenSeries], measured: MeasuredScenes) -> PlacedSeries:
-    """Registers every scene, all series of a place together.
-
-    Args:
-        seen: series that can be compared, scenes where their maps have them.
-        measured: what they are placed by.
-    """
+    """Registers every scene, all series of a place together."""
     placed = {one.name: one for one in seen}
     placements: dict[str, Placement] = {}
     telling: dict[str, SeriesRequest] = {}
-    for stated in _places(seen).values():
+    places: dict[tuple[str, float], list[SeenSeries]] = {}
+    for one in seen:
+        if one.session.series.kind == "object":
+            places.setdefault(one.session.place, []).append(one)
+    for stated in places.values():
         members, placement = _as_drawn(stated, measured)
         if placement is None:
             continue
@@ -109,20 +100,10 @@ def _light_DN(one: SeenSeries) -> float:
     return exposures * float(np.mean(one.expected.signal_DN))
 
 
-def _places(seen: Sequence[SeenSeries]) -> dict[tuple[str, float], list[SeenSeries]]:
-    """Object series by where their scene stood."""
-    places: dict[tuple[str, float], list[SeenSeries]] = {}
-    for one in seen:
-        if one.session.series.kind == "object":
-            places.setdefault(one.session.place, []).append(one)
-    return places
-
-
 def _as_drawn(members: Sequence[SeenSeries], measured: MeasuredScenes) -> tuple[Sequence[SeenSeries], Placement | None]:
     """Series of one place with the maps that show their scene more truly, and where it lies.
 
-    A straight or round border is drawn as its map has it or as it runs: a map of few points a pixel has stairs, which real pixels,
-    that see their whole square, have not; most simulations see the middle of it.
+    A map of few points a pixel has stairs along a straight or round border; a pixel that sees its whole square has none.
     """
     placement = _placement(members, measured)
     asked = members[0].session.request
@@ -156,7 +137,7 @@ def _placement(members: Sequence[SeenSeries], measured: MeasuredScenes) -> Place
     if not found.found:
         return None
 
-    def drawn(at: tuple[float, float]) -> list[NDArray[np.float64]]:
+    def drawn(at: tuple[float, float]) -> list[FloatArray]:
         return measured.drawn(members, at)
 
     # drawn where it lies, an edge shows what is left of its displacement more truly than any resampled picture
@@ -176,16 +157,13 @@ def _placement(members: Sequence[SeenSeries], measured: MeasuredScenes) -> Place
 
 def _smeared(
     members: Sequence[SessionSeries],
-    seen: Sequence[NDArray[np.float64]],
-    pictured: Sequence[NDArray[np.float64]],
-    noises: Sequence[NDArray[np.floating]],
-    clean: NDArray[np.bool_],
+    seen: Sequence[FloatArray],
+    pictured: Sequence[FloatArray],
+    noises: Sequence[RealArray],
+    clean: BoolArray,
     found: Placement,
 ) -> tuple[Placement, _Blur]:
-    """Where a scene lies whose pictures are smeared by more than their slopes show, and the blur that leaves least of them.
-
-    The blur goes along the belt in proportion to the exposure, or to all sides; none, where the least of either leaves no less.
-    """
+    """Where a scene lies whose pictures are smeared by more than slopes show, and the blur that leaves least of them."""
     from scipy.ndimage import gaussian_filter, uniform_filter1d
 
     exposures_ms = [item.request.exposure_ms for item in members]
@@ -194,7 +172,7 @@ def _smeared(
     axis = 1 if members[0].request.belt_axis == "column" else 0
 
     def box(length_px: float) -> _Blur:
-        def blur(pictures: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+        def blur(pictures: Sequence[FloatArray]) -> list[FloatArray]:
             # odd: an even box would move them by half a pixel
             lengths = [max(2 * round((length_px * share - 1.0) / 2.0) + 1, 1) for share in shares]
             return [uniform_filter1d(one, at, axis=axis) for one, at in zip(pictures, lengths, strict=True)]
@@ -206,7 +184,7 @@ def _smeared(
 
     # smeared, it may be found far from where it lies
     unmoved = replace(found, row_px=0.0, column_px=0.0)
-    best: tuple[Placement, _Blur, float] = found, _as_it_is, left_over(seen, pictured, clean, found)
+    best: tuple[Placement, _Blur, float] = found, lambda pictures: pictures, left_over(seen, pictured, clean, found)
     for make, sizes in ((box, _BOXES_PX), (gaussian, _GAUSSIANS_PX)):
         here = best[2]
         tried = [make(size)(pictured) for size in sizes[:_SMEARED_SIZES]]
@@ -225,11 +203,7 @@ def _smeared(
     return best[0], best[1]
 
 
-def _as_it_is(pictures: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.float64]]:
-    return pictures
-
-
-def inside(mask: NDArray[np.bool_], placement: Placement) -> NDArray[np.bool_]:
+def inside(mask: BoolArray, placement: Placement) -> BoolArray:
     """The mask (row, column) less the border that a displaced picture does not cover."""
     return without_border(mask, 2 + math.ceil(max(abs(placement.row_px), abs(placement.column_px))))
 
@@ -241,14 +215,7 @@ def displacement_probes(placement: Placement, *, between_points: bool) -> list[S
     """
     stated_px = math.hypot(scales.POSITION_SD_PX, ANYWHERE_SD_PX if between_points else 0.0)
     return [
-        Scalar(
-            axis="sharpness",
-            name=name,
-            unit="px",
-            value=value,
-            sd=math.hypot(sd, stated_px),
-            sampling_sd=sd,
-        )
+        Scalar(axis="sharpness", name=name, unit="px", value=value, sd=math.hypot(sd, stated_px), sampling_sd=sd)
         for name, value, sd in (
             (ALONG_ROWS, placement.row_px, placement.row_sd_px),
             (ALONG_COLUMNS, placement.column_px, placement.column_sd_px),

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import BoolArray, FloatArray, RealArray
 from ..session.even_maps import local_range
 
 _LEAST_STEP = 0.1  # of the largest thickness, over three pixels' distance
@@ -20,7 +21,7 @@ _BLURS_PX = (0.7, 1.5)
 _FARTHEST_PX = 6.0  # from a border, beyond which distances are alike
 
 
-def sampled_at_points(thickness_mm: Mapping[str, NDArray[np.floating]] | None) -> bool:
+def sampled_at_points(thickness_mm: Mapping[str, RealArray] | None) -> bool:
     """Whether the borders in a scene's maps (row, column), by material, run between pixels and cut none."""
     whole = every = 0
     for image in (thickness_mm or {}).values():
@@ -39,18 +40,11 @@ def sampled_at_points(thickness_mm: Mapping[str, NDArray[np.floating]] | None) -
     return every >= _LEAST_BORDERS and whole > _MOSTLY * every
 
 
-def blurred_between_points(
-    thickness_mm: Mapping[str, NDArray[np.floating]], signal: NDArray[np.float64]
-) -> NDArray[np.float32]:
+def blurred_between_points(thickness_mm: Mapping[str, RealArray], signal: FloatArray) -> NDArray[np.float32]:
     """What a blur of borders that run smoothly between the points adds to a blur of the jumps (image, row, column), DN.
 
-    Between the points a border is taken to run as smoothly as they allow (three smoothnesses, two blurs): its distance is
-    smoothed again and again, and kept to the side that each point says. A border along rows or columns adds nothing, and what
-    is the same all along a border is left out: that is a blur.
-
-    Args:
-        thickness_mm: maps (row, column), by material.
-        signal: expected (row, column), DN.
+    A border is taken to run as smoothly as the points allow (three smoothnesses, two blurs): its distance is smoothed, many times,
+    and kept to the side that each point says. What is the same all along a border is left out: that is a blur.
 
     Source: R. T. Whitaker, Reducing aliasing artifacts in iso-surfaces of binary volumes, IEEE Symposium on Volume
         Visualization 2000, 23-32, doi:10.1109/VV.2000.10000.
@@ -73,7 +67,7 @@ def blurred_between_points(
     return images.reshape(-1, *signal.shape).astype(np.float32)
 
 
-def _smooth_borders(thick: NDArray[np.bool_]) -> list[NDArray[np.float64]]:
+def _smooth_borders(thick: BoolArray) -> list[FloatArray]:
     """Covered share of pixels (row, column) whose middles lie behind a border or not, as it runs the smoother the longer."""
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 

@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.series_request import SeriesRequest
+from ..arrays import BoolArray, FloatArray, RealArray
 from ..probes.fixed_pattern import OUTLIER_SD, Pattern, pattern_noise, pattern_of
 from ..probes.line_scalars import line_pattern
 from ..probes.model_scalars import expected_scalars, with_pattern
@@ -38,20 +38,15 @@ _CODES_SHARE = 0.02  # range of codes to the pixels of the frames looked at, at 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeriesModel:
-    """One series as the base twin expects it.
-
-    Fields: session; expected; context of its scalar probes; scalars_alone: expected scalar probes by name, without what line noise
-    leaves in dark and gain map; scalars: with that; placement of its scene, and place: the series that tells the displacement there
-    (None: not found).
-    """
+    """One series as the base twin expects it."""
 
     session: SessionSeries
     expected: ExpectedSeries
-    context: ScalarContext
-    scalars_alone: dict[str, float]
-    scalars: dict[str, float]
-    placement: Placement | None
-    place: SeriesRequest | None
+    context: ScalarContext  # of its scalar probes
+    scalars_alone: dict[str, float]  # by name, without what line noise leaves in dark and gain map
+    scalars: dict[str, float]  # by name, with that
+    placement: Placement | None  # of its scene; None: not found
+    place: SeriesRequest | None  # the series that tells the displacement there; None: not found
 
     @property
     def tells_displacement(self) -> bool:
@@ -66,17 +61,14 @@ class SeriesModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Absorbed:
-    """What calibration takes in of a change.
+    """What calibration takes in of a change."""
 
-    Fields: mean_DN: change of each calibrating mean frame (row, column or 1, 1), by name; scalars of these series under the change;
-    dark_DN: change of the dark by exposure (ms); gain: relative change of the gain map; lines under the change.
-    """
-
+    # (row, column or 1, 1): of each calibrating mean frame, by name
     mean_DN: dict[str, Map] = field(default_factory=dict)
-    scalars: dict[str, dict[str, float]] = field(default_factory=dict)
-    dark_DN: dict[float, Map] = field(default_factory=dict)
-    gain: Map = field(default_factory=lambda: NOWHERE)
-    lines: Lines = field(default_factory=dict)
+    scalars: dict[str, dict[str, float]] = field(default_factory=dict)  # of these series under the change
+    dark_DN: dict[float, Map] = field(default_factory=dict)  # by exposure, ms
+    gain: Map = field(default_factory=lambda: NOWHERE)  # relative
+    lines: Lines = field(default_factory=dict)  # under the change
 
     @property
     def divides(self) -> Map:
@@ -95,18 +87,13 @@ class Asked:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionModel:
-    """A session's series under changes of the forward model.
-
-    Fields: model; maps: dark and gain map of the calibrating series; series, in order of time; signals_DN: mean expected signal over
-    pixels that do not stand out, by name; lines_DN2: variance of rows and of columns from exposure to exposure, DN^2, that is no
-    effect.
-    """
+    """A session's series under changes of the forward model."""
 
     model: ForwardModel
-    maps: CalibratedMaps
-    series: tuple[SeriesModel, ...]
-    signals_DN: Mapping[str, float]
-    lines_DN2: tuple[float, float]
+    maps: CalibratedMaps  # of the calibrating series
+    series: tuple[SeriesModel, ...]  # in order of time
+    signals_DN: Mapping[str, float]  # mean expected over pixels that do not stand out, by name
+    lines_DN2: tuple[float, float]  # variance of rows and of columns from exposure to exposure, DN^2, that is no effect
 
     def usual_lines(self, item: SessionSeries) -> tuple[float, float]:
         """Variance of rows and columns, DN^2, that a series' corrected mean frame has from noise of lines which is no effect."""
@@ -144,12 +131,10 @@ class SessionModel:
             else:
                 mean_DN[one.name] = self._moved_alone(one, model)
                 scalars[one.name] = expected_scalars(model, one.context)
-        dark_DN: dict[float, Map] = {}
-        for exposure, weights in self.maps.darks.weights.items():
-            dark = NOWHERE
-            for name, weight in weights.items():
-                dark = dark + np.float32(weight) * mean_DN[name]
-            dark_DN[exposure] = dark
+        dark_DN = {
+            exposure: sum((np.float32(weight) * mean_DN[name] for name, weight in weights.items()), NOWHERE)
+            for exposure, weights in self.maps.darks.weights.items()
+        }
         gain = NOWHERE
         for one in calibrating:
             if one.session.series.kind == "flat":
@@ -201,13 +186,9 @@ class SessionModel:
     def with_patterns(
         self, one: SeriesModel, values: Mapping[str, float], lines: Lines, moved: Map
     ) -> Mapping[str, float]:
-        """Scalars with what line noise leaves in dark and gain map, and what a moved picture shows of pixels, blocks and lines.
+        """Scalars with what lines of calibrating series leave in dark and gain map, and a moved picture in pixels and lines.
 
-        Args:
-            one: the series.
-            values: its scalar probes without that, by name.
-            lines: of the calibrating series.
-            moved: change of the corrected mean frame (row, column or 1, 1), DN.
+        values: scalar probes without that, by name; moved: change of the corrected mean frame (row, column or 1, 1), DN.
         """
         if FIXED not in values:
             return values
@@ -236,31 +217,23 @@ class SessionModel:
         return {name: away + change.displacement.get(name, 0.0) for name, away in carried.items()}
 
     def under(self, one: SeriesModel, asked: Asked) -> SeriesModel:
-        """One series as it is expected under a change that can show there; what line noise leaves in maps aside.
-
-        Raises:
-            InputError: the twin knows too little for it.
-        """
+        """One series under a change that can show there, less what line noise leaves in maps; raises as `ForwardModel.under`."""
         expected = self.model.under(*self._found(one, asked.change))
         return replace(one, expected=expected, scalars={**one.scalars, **expected_scalars(expected, one.context)})
 
-    def with_scene(self, one: SeriesModel, thickness_mm: Mapping[str, NDArray[np.floating]], asked: Asked) -> Moved:
+    def with_scene(self, one: SeriesModel, thickness_mm: Mapping[str, RealArray], asked: Asked) -> Moved:
         """What another scene would show in a series (`under` the change that is asked), less what its own shows there."""
         change, request = self._found(one, asked.change)
         changed = self.model.under(change, replace(request, thickness_mm=thickness_mm))
         moved = np.asarray(np.asarray(changed.mean_DN) - np.asarray(one.expected.mean_DN), dtype=np.float32)
         return moved / asked.absorbed.divides, expected_scalars(changed, one.context)
 
-    def from_beyond(self, one: SeriesModel, change: Change) -> NDArray[np.float64]:
+    def from_beyond(self, one: SeriesModel, change: Change) -> FloatArray:
         """What the surroundings would let into the picture of a series (row, column), DN, see `LineModel.from_beyond`."""
         return self.model.from_beyond(*self._found(one, change))
 
     def _alone(self, one: SeriesModel, change: Change, known: Known) -> tuple[ExpectedSeries, Map, Mapping[str, float]]:
-        """A series under a change, its mean frame's change (DN) and its scalar probes, dark and gain map left as they were.
-
-        Raises:
-            InputError: the twin knows too little for it.
-        """
+        """A series under a change, its mean frame's change (DN) and its scalar probes, dark and gain map left as they were."""
         shown, request = self._found(one, change)
         own = shown.whenever_it_began(request)
         if own in known:
@@ -280,19 +253,13 @@ def session_model(
     maps: CalibratedMaps,
     placed: PlacedSeries,
     summaries: Mapping[str, SeriesSummary],
-    clean: NDArray[np.bool_],
+    clean: BoolArray,
     *,
     lines_DN2: tuple[float, float],
 ) -> SessionModel:
     """The session's series as the base twin expects them, with what their scalar probes refer to.
 
-    Args:
-        model: the base twin.
-        maps: dark and gain map of the calibrating series.
-        placed: series with their scenes drawn where they lie.
-        summaries: what the frames' noise says, by name of series.
-        clean: pixels in use that do not stand out (row, column).
-        lines_DN2: variance of rows and columns from exposure to exposure that the panel has all the time, DN^2.
+    summaries: by name of series; clean: pixels in use that do not stand out (row, column); lines_DN2: as in `SessionModel`.
     """
     seen = placed.seen
     signals_DN = {one.name: mean_over(one.expected.signal_DN, clean) for one in seen}
@@ -341,7 +308,7 @@ def session_model(
 def _context(
     shown: SeenSeries,
     maps: CalibratedMaps,
-    clean: NDArray[np.bool_],
+    clean: BoolArray,
     *,
     signal_DN: float,
     previous_DN: float | None,

@@ -14,10 +14,10 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.line_state import FixedPattern, TilePattern
+from ..arrays import BoolArray, FloatArray, RealArray
 from ..session.even_maps import NEIGHBOURS_PX, mean_over
 from ..session.summaries import BLOCK_PX, LEAST_NOISE_DN2, in_blocks
 from .noise_correlation import autocovariance, correlation_sum
@@ -29,23 +29,13 @@ _OUT_OF_NEIGHBOURS = 3.0  # times the distance of their quartiles; of noise 7 st
 _LINE_CLEAN = 0.2  # share of a line's pixels that do not stand out, below which the line as a whole may have changed
 _LINE_CHANGE = 0.15  # relative change of a line's gain beyond which it counts as a defect
 
-Pattern = NDArray[np.float64]  # (4,), variances, DN^2, in the order that the module's docstring gives
+Pattern = FloatArray  # (4,), variances, DN^2, in the order that the module's docstring gives
 
 
 def pattern_noise(
-    model: ExpectedSeries,
-    mask: NDArray[np.bool_],
-    frames: int,
-    map_quantum_DN2: float,
-    map_white_DN2: float,
-    *,
-    lines: bool,
+    model: ExpectedSeries, mask: BoolArray, frames: int, map_quantum_DN2: float, map_white_DN2: float, *, lines: bool
 ) -> Pattern:
-    """What noise alone leaves in the corrected mean frame.
-
-    map_quantum_DN2, map_white_DN2: noise that dark and gain map bring in, correlated as quanta are, and white. lines: whether
-    lines can be judged.
-    """
+    """What noise of frames and of maps (correlated as quanta are, and white) leaves in the corrected mean frame."""
     q = mean_over(model.quantum_variance_DN2, mask) / frames + map_quantum_DN2
     w = max(mean_over(model.white_variance_DN2, mask), LEAST_NOISE_DN2) / frames + map_white_DN2
     # fewer pixels of a line count than it has
@@ -90,25 +80,21 @@ def shares_of_pixels(shape: tuple[int, int], field: FixedPattern) -> Pattern:
 
 @lru_cache(maxsize=64)
 def shares_of_tiles(shape: tuple[int, int], tiles: TilePattern) -> Pattern:
-    """What gains of tiles of variance 1 DN^2 add to a pattern over a panel of `shape`.
-
-    All of these are differences of neighbours, so that each is a sum over the tiles of squared differences of the shares that
-    neighbours have in a tile.
-    """
+    """What gains of tiles of variance 1 DN^2 add to a pattern over a panel: of each tile, differences of neighbours' shares in it."""
     of_axes = tiles.rows.tile_of(shape[0]), tiles.columns.tile_of(shape[1])
     row_in, column_in = (np.eye(int(number[-1]) + 1)[number] for number in of_axes)
 
-    def blocks(inside: NDArray[np.float64]) -> NDArray[np.float64]:
+    def blocks(inside: FloatArray) -> FloatArray:
         whole = inside[: len(inside) - len(inside) % BLOCK_PX]
         return np.asarray(whole.reshape(-1, BLOCK_PX, inside.shape[1]).mean(axis=1))
 
-    def differing(inside: NDArray[np.float64]) -> float:
+    def differing(inside: FloatArray) -> float:
         return float(np.mean(np.sum(np.diff(inside, axis=0) ** 2, axis=1))) / 2.0
 
-    def bent(inside: NDArray[np.float64]) -> float:
+    def bent(inside: FloatArray) -> float:
         return float(np.mean(np.sum(np.diff(inside, n=2, axis=0) ** 2, axis=1))) / 6.0
 
-    def of_mean(inside: NDArray[np.float64]) -> float:
+    def of_mean(inside: FloatArray) -> float:
         return float(np.sum(inside.mean(axis=0) ** 2))
 
     of_blocks = differing(blocks(column_in)) * float(np.mean(np.sum(blocks(row_in) ** 2, axis=1)))
@@ -116,7 +102,7 @@ def shares_of_tiles(shape: tuple[int, int], tiles: TilePattern) -> Pattern:
     return np.array([differing(column_in), of_blocks, of_rows, of_columns])
 
 
-def smooth_part(residual: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+def smooth_part(residual: FloatArray, mask: BoolArray) -> FloatArray:
     """Cubic surface (row, column) through the medians of blocks: what map probes hold, and what is no pixel's own."""
     rows, columns = residual.shape
     if min(rows, columns) < _LEAST_SURFACE:
@@ -134,10 +120,10 @@ def smooth_part(residual: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArr
 
 
 @lru_cache(maxsize=4)
-def _cubic_terms(rows: int, columns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _cubic_terms(rows: int, columns: int) -> tuple[FloatArray, FloatArray]:
     """Terms of the cubic surface at the middles of blocks (block row, block column, term) and at pixels (row, column, term)."""
 
-    def terms(places: Sequence[NDArray[np.floating]]) -> NDArray[np.float64]:
+    def terms(places: Sequence[RealArray]) -> FloatArray:
         y, x = np.meshgrid(
             *(2.0 * at / length - 1.0 for at, length in zip(places, (rows, columns), strict=True)), indexing="ij"
         )
@@ -148,19 +134,11 @@ def _cubic_terms(rows: int, columns: int) -> tuple[NDArray[np.float64], NDArray[
 
 
 def pattern_statistics(
-    residual: NDArray[np.float64],
-    signal_DN: NDArray[np.float64] | None,
-    *,
-    clean: NDArray[np.bool_],
-    good: NDArray[np.bool_],
+    residual: FloatArray, signal_DN: FloatArray | None, *, clean: BoolArray, good: BoolArray
 ) -> Pattern:
     """What stands in a flat's or dark's residual map (row, column), DN.
 
-    Args:
-        residual: measured mean frame less the model's.
-        signal_DN: expected signal of a flat (row, column); None: lines are not judged.
-        clean: pixels without those that stand out.
-        good: all pixels in use.
+    signal_DN: expected of a flat (row, column), None: lines are not judged; clean: pixels in use (`good`) that do not stand out.
     """
     level = residual - smooth_part(residual, clean)
     pair = clean[:, 1:] & clean[:, :-1]
@@ -179,7 +157,7 @@ def pattern_statistics(
     return np.array([pixel, of_blocks, _of_lines(level, clean, changed), _of_lines(level.T, clean.T, changed.T)])
 
 
-def _of_lines(residual: NDArray[np.float64], clean: NDArray[np.bool_], changed: NDArray[np.bool_]) -> float:
+def _of_lines(residual: FloatArray, clean: BoolArray, changed: BoolArray) -> float:
     """A sixth of the mean square of second differences of the means of rows, DN^2; NaN: too few can be seen."""
     # a stretch of defects is no line that changed: of that nearly all stands out
     use = np.where((clean.mean(axis=1) >= _LINE_CLEAN)[:, None], clean, changed)
@@ -189,7 +167,7 @@ def _of_lines(residual: NDArray[np.float64], clean: NDArray[np.bool_], changed: 
     return float(np.mean(bent**2)) / 6.0 if bent.size >= _LEAST_LINES else math.nan
 
 
-def pattern_of(change_DN: NDArray[np.floating]) -> Pattern:
+def pattern_of(change_DN: RealArray) -> Pattern:
     """What a change of the mean frame (row, column or 1, 1), DN, leaves in a pattern."""
     if change_DN.size == 1:
         return np.zeros(4)
@@ -205,25 +183,24 @@ def pattern_of(change_DN: NDArray[np.floating]) -> Pattern:
 
 
 @lru_cache(maxsize=4)
-def _to_surface(rows: int, columns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _to_surface(rows: int, columns: int) -> tuple[FloatArray, FloatArray]:
     """What makes of means of blocks the cubic surface's factors (term, block), and its terms at pixels (row, column, term)."""
     at_blocks, at_pixels = _cubic_terms(rows, columns)
     return np.asarray(np.linalg.pinv(at_blocks.reshape(-1, at_blocks.shape[2])), dtype=np.float64), at_pixels
 
 
 def count_outliers(
-    residual: NDArray[np.float64],
-    variance: NDArray[np.float64],
+    residual: FloatArray,
+    variance: FloatArray,
     pixel_DN2: float,
     *,
-    clean: NDArray[np.bool_],
-    good: NDArray[np.bool_],
-    least_DN: NDArray[np.float64] | None = None,
+    clean: BoolArray,
+    good: BoolArray,
+    least_DN: FloatArray | None = None,
 ) -> int:
     """Good pixels of a residual map (row, column) that stand out of noise (variance, DN^2), pattern and the clean ones around.
 
-    An edge that a picture left in a residual is none of its pixels' own: beside it neighbours differ as much. least_DN (row,
-    column): departures below it make no bad pixel, such as dust on a flat.
+    Beside an edge that a picture left neighbours differ as much. least_DN (row, column): departures below it are dust, no bad pixel.
     """
     level = residual - smooth_part(residual, clean)
     limit = OUTLIER_SD * np.sqrt(variance)

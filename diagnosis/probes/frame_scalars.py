@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
+from ..arrays import FloatArray
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2, SeriesSummary
 from .fixed_pattern import Pattern
 from .lasting import LEAST_FRAMES
@@ -49,16 +49,10 @@ def measured_scalars(
 ) -> list[Scalar]:
     """The scalar probes of measured frames with their standard deviations (sampling and floor together).
 
-    Args:
-        summary: what the frames' noise says.
-        base: the series as the base twin expects it, whose noise the standard deviations come from.
-        context: what the probes refer to.
-        dark_mean_DN: mean of the dark that an afterglow is judged against.
-        pattern: of the corrected mean frame; None: none was looked for.
-        outliers, all_outliers: pixels that stand out in this series, and in any.
-        memory: share of such pixels' variance that lasts from frame to frame, and how many they are.
-        copies: frames of all series that this one stands for, which are copies of earlier ones of their series.
-        lasting: pixels whose level lasts in a later dark.
+    base: as the base twin expects the series; dark_mean_DN: of the dark that an afterglow is judged against; pattern: of the
+    corrected mean frame, None: none was looked for; outliers, all_outliers: pixels that stand out in this series (None: not looked
+    for), and in any; memory: share of such pixels' variance that lasts, and how many they are; copies: frames of all series that
+    this one stands for, which are copies of earlier ones; lasting: pixels whose level lasts in a later dark.
     """
     found = _Found(summary=summary, base=base, context=context)
     if summary.frames > 2 and found.noisy:
@@ -67,10 +61,9 @@ def measured_scalars(
     found.trends()
     found.afterglow(dark_mean_DN)
     found.codes()
-    stands = context.calibrates or context.rounded
-    if pattern is not None and not stands:
+    if pattern is not None:
         found.fixed_pattern(pattern)
-    if outliers is not None and not stands:
+    if outliers is not None:
         found.add("tails", OUTLIERS, "sqrt(pixels)", root_of_count(outliers), COUNT_SD, "pixels")
         if memory is not None and memory[1] >= _LEAST_OUTLIERS and summary.frames >= _LEAST_FRAMES:
             share, count = memory
@@ -135,11 +128,7 @@ class _Found:
 
     @property
     def noisy(self) -> bool:
-        """Whether frames have noise of their own.
-
-        Rounded ones have what their pixels' distances from the next code make of it. A picture that fades without any noise
-        says how fast it fades, which the afterglow's levels say without a law's errors.
-        """
+        """Whether frames have noise of their own: rounded ones and pictures that fade without noise have none."""
         if self.context.rounded:
             return False
         return self.context.kind != "afterglow" or sum(self.means_DN2) > LEAST_NOISE_DN2
@@ -147,7 +136,9 @@ class _Found:
     def shared(self, quantum_DN2: float, white_DN2: float) -> float:
         """Times that correlated neighbours raise the variance of a variance."""
         share = quantum_DN2 / max(quantum_DN2 + white_DN2, 1e-12)
-        return 1.0 + share**2 * (_squared_correlations(self.base) - 1.0)
+        table = np.asarray(self.base.noise_autocovariance, dtype=np.float64) ** 2
+        squares = float(table[0, 0] + 2.0 * table[0, 1:].sum() + 2.0 * table[1:, 0].sum() + 4.0 * table[1:, 1:].sum())
+        return 1.0 + share**2 * (squares - 1.0)
 
     def noise_by_label(self) -> None:
         """Variance, and correlation of neighbours, of each label's pixels."""
@@ -250,15 +241,10 @@ class _Found:
             self.add("position", name, "1", value, 1.0 / math.sqrt(lines), "fixed_pattern lines")
 
 
-def _log_variance_of_steps(values: NDArray[np.float64], freedom: float) -> tuple[float, float]:
+def _log_variance_of_steps(values: FloatArray, freedom: float) -> tuple[float, float]:
     """Logarithm of the variance that steps from value to value (n,) show, free of what few of them make too low; its sd."""
     from scipy.special import polygamma
 
     variance = float(np.mean(np.diff(values) ** 2)) / 2.0
     bias = float(polygamma(0, freedom / 2.0)) - math.log(freedom / 2.0)
     return math.log(max(variance, 1e-12)) - bias, math.sqrt(float(polygamma(1, freedom / 2.0)))
-
-
-def _squared_correlations(expected: ExpectedSeries) -> float:
-    table = np.asarray(expected.noise_autocovariance, dtype=np.float64) ** 2
-    return float(table[0, 0] + 2.0 * table[0, 1:].sum() + 2.0 * table[1:, 0].sum() + 4.0 * table[1:, 1:].sum())

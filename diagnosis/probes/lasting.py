@@ -11,9 +11,9 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.line.line_state import TelegraphPixels
+from ..arrays import BoolArray, FloatArray, RealArray
 from ..session.even_maps import NEIGHBOURS_PX
 
 LEAST_FRAMES = 10  # below, levels that last and chance are too much alike
@@ -37,13 +37,8 @@ def _limits(frames: int) -> tuple[float, float]:
 
 
 def lasting_pixels(
-    stack_variance_DN2: NDArray[np.floating],
-    pair_variance_DN2: NDArray[np.floating],
-    frames: int,
-    good: NDArray[np.bool_],
-    *,
-    least_DN2: float,
-) -> NDArray[np.bool_]:
+    stack_variance_DN2: RealArray, pair_variance_DN2: RealArray, frames: int, good: BoolArray, *, least_DN2: float
+) -> BoolArray:
     """Good pixels (row, column) whose level lasts in a dark of so many frames; none where frames have no noise of least_DN2.
 
     Where most of those around do as well, a picture fades.
@@ -59,7 +54,7 @@ def lasting_pixels(
     noisier, memory = _limits(frames)
     noisy = good & (stack_variance_DN2 > noisier * usual)
     lasts = pair_variance_DN2 < (1.0 - memory) * stack_variance_DN2
-    found: NDArray[np.bool_] = noisy & lasts
+    found: BoolArray = noisy & lasts
     around = uniform_filter(found.astype(np.float64), NEIGHBOURS_PX, mode="constant")
     found &= around < _MOST_AROUND
     return found if np.count_nonzero(found) < _MOST * np.count_nonzero(good) else none
@@ -68,9 +63,7 @@ def lasting_pixels(
 def chances(law: TelegraphPixels | None, darks: tuple[tuple[int, int], ...]) -> tuple[float, list[float], float]:
     """Chances of a pixel that jumps: its level lasts in any dark; it stands out in each, or in any, but lasts in none.
 
-    Args:
-        law: None: no pixel jumps.
-        darks: frames of each dark, and exposures a frame.
+    darks: frames of each dark, and exposures a frame.
     """
     if law is None or law.share == 0.0 or not darks:
         return 0.0, [0.0] * len(darks), 0.0
@@ -96,7 +89,7 @@ def _like(law: TelegraphPixels) -> TelegraphPixels:
 
 
 @lru_cache(maxsize=64)
-def _in_darks(law: TelegraphPixels, darks: tuple[tuple[int, int], ...]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _in_darks(law: TelegraphPixels, darks: tuple[tuple[int, int], ...]) -> tuple[BoolArray, BoolArray]:
     """Whether drawn pixels that jump last in any dark (pixel,), and stand out of each (dark, pixel)."""
     lasts, stands = np.zeros(_DRAWN, dtype=bool), []
     for number, (frames, averaged) in enumerate(darks):
@@ -112,9 +105,7 @@ def _in_darks(law: TelegraphPixels, darks: tuple[tuple[int, int], ...]) -> tuple
 
 
 @lru_cache(maxsize=128)
-def _levels(
-    law: TelegraphPixels, frames: int, averaged: int, number: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _levels(law: TelegraphPixels, frames: int, averaged: int, number: int) -> tuple[FloatArray, FloatArray]:
     """Heights of drawn pixels, read noises (pixel,), and exposures of each frame in which they are up (frame, pixel)."""
     height_reads, stay = law.of_pixels(_DRAWN, np.random.default_rng(_SEED))
     rng = np.random.default_rng([_SEED, number, frames])

@@ -14,19 +14,15 @@ from .scalar_context import ScalarContext
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """What rows and columns have in common for one reason.
+    """What rows and columns have in common for one reason."""
 
-    Fields: row, column: variances, DN^2, of flicker relative; together_lines: over which it fades; squares: what these are multiplied
-    with in all good pixels, and in those of each label: 1, of flicker the mean square of the signal; of_rows, of_columns: the same of
-    means along rows and columns.
-    """
-
-    row: float
+    row: float  # with column: variances, DN^2, of flicker relative
     column: float
-    together_lines: float
+    together_lines: float  # over which it fades
+    # by which these are multiplied in all good pixels, and in each label: 1, or the mean square of the signal
     squares: tuple[float, ...]
-    of_rows: float = 1.0
-    of_columns: float = 1.0
+    of_rows: float = 1.0  # the same of means along rows
+    of_columns: float = 1.0  # and along columns
 
     def pixel(self, label: int | None) -> tuple[float, float]:
         """Variances of rows and of columns in single pixels, DN^2: of all good ones, or of a label's."""
@@ -36,12 +32,9 @@ class _Part:
 
 @dataclass(frozen=True, slots=True)
 class LineNoise:
-    """Variances, DN^2, of what rows and columns of one frame have in common.
+    """Variances, DN^2, of what rows and columns of one frame have in common."""
 
-    parts: offsets, the same with and without light, and lines that flicker with it.
-    """
-
-    parts: tuple[_Part, ...]
+    parts: tuple[_Part, ...]  # offsets, the same with and without light, and lines that flicker with it
 
     @staticmethod
     def of(expected: ExpectedSeries, context: ScalarContext) -> "LineNoise":

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import BoolArray, FloatArray, RealArray
 from ._projection_loops import REACH, weigh_template
 from .probes import ProbeName
 from .registration import gradient
@@ -23,7 +24,7 @@ class Template:
     axis: str
     name: str
     unit: str
-    image: NDArray[np.floating]
+    image: RealArray
 
 
 class MapProjection:
@@ -36,10 +37,10 @@ class MapProjection:
         self,
         templates: Sequence[Template],
         *,
-        mask: NDArray[np.bool_],
-        quantum_DN2: NDArray[np.floating],
-        white_DN2: NDArray[np.floating],
-        autocovariance_table: NDArray[np.floating],
+        mask: BoolArray,
+        quantum_DN2: RealArray,
+        white_DN2: RealArray,
+        autocovariance_table: RealArray,
     ) -> None:
         """`quantum_DN2`, `white_DN2` (row, column): variances of the mean frame's correlated and white parts."""
         weight = np.where(mask, 1.0 / np.maximum(np.asarray(quantum_DN2 + white_DN2, dtype=np.float64), 1e-30), 0.0)
@@ -59,7 +60,7 @@ class MapProjection:
         left = np.asarray(rows @ spread.T, dtype=np.float64)
         own = np.diag(left).copy()
         chosen: list[int] = []
-        columns: list[NDArray[np.float64]] = []
+        columns: list[FloatArray] = []
         for number in range(len(used)):
             rest = float(left[number, number])
             if rest > _INDEPENDENT * own[number]:
@@ -85,12 +86,12 @@ class MapProjection:
     def __len__(self) -> int:
         return len(self.names)
 
-    def apply(self, images: NDArray[np.floating]) -> NDArray[np.float64]:
+    def apply(self, images: RealArray) -> FloatArray:
         """Standardised projections (..., probe) of maps (..., row, column), DN."""
         pixels = images.reshape(*images.shape[:-2], -1).astype(np.float32, copy=False)
         return np.asarray(pixels @ self._rows.T, dtype=np.float64)
 
-    def apply_each(self, images: Sequence[NDArray[np.floating]]) -> NDArray[np.float64]:
+    def apply_each(self, images: Sequence[RealArray]) -> FloatArray:
         """Standardised projections (image, probe) of maps, (row, column) or (1, 1) where all pixels are alike, DN."""
         result = np.empty((len(images), len(self)))
         wide = [number for number, image in enumerate(images) if image.size > 1]
@@ -101,12 +102,12 @@ class MapProjection:
             result[wide] = self.apply(np.stack([images[number] for number in wide]))
         return result
 
-    def pixel_noise(self, sd_DN: NDArray[np.floating]) -> NDArray[np.float64]:
+    def pixel_noise(self, sd_DN: RealArray) -> FloatArray:
         """Variance (probe,) that independent noise of the pixels, sd_DN (row, column), gives the projections."""
         variance = np.asarray(sd_DN, dtype=np.float32).ravel() ** 2
         return np.array([np.square(row) @ variance for row in self._rows], dtype=np.float64)
 
-    def field_noise(self, sd_DN: NDArray[np.floating], side_px: float) -> NDArray[np.float64]:
+    def field_noise(self, sd_DN: RealArray, side_px: float) -> FloatArray:
         """The same of noise that is alike over an area of side_px x side_px pixels: that of squares of about this side."""
         side = max(round(side_px), 1)
         if side == 1:
@@ -121,7 +122,7 @@ class MapProjection:
             result[number] = over * float(np.sum(squares.astype(np.float64) ** 2))
         return result
 
-    def column_noise(self, sd_DN: NDArray[np.floating]) -> NDArray[np.float64]:
+    def column_noise(self, sd_DN: RealArray) -> FloatArray:
         """The same of noise that each column has in common."""
         sd = np.asarray(sd_DN, dtype=np.float32)
         result = np.empty(len(self))
@@ -129,18 +130,14 @@ class MapProjection:
             result[number] = np.sum(np.sum(row.reshape(self._shape) * sd, axis=0, dtype=np.float64) ** 2)
         return result
 
-    def line_noise(self) -> NDArray[np.float64]:
+    def line_noise(self) -> FloatArray:
         """Variance (2, probe) that noise of 1 DN, common to each row and then common to each column, gives the projections."""
         pixels = self._rows.reshape(len(self), *self._shape)
         return np.stack([np.sum(pixels.sum(axis=axis, dtype=np.float64) ** 2, axis=1) for axis in (2, 1)])
 
 
-def _separated(table: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Kernels (part, tap) along rows and along columns whose products add up to an autocovariance, a quarter of each as of the table.
-
-    A spread that no effect has changed is one such product. Lags that the table does not hold are 0: the loops
-    read REACH of them, whatever they are given.
-    """
+def _separated(table: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Kernels (part, tap) along rows and along columns whose products add up to an autocovariance, 0 beyond what its table holds."""
     taps = np.zeros((1 + REACH, 1 + REACH))
     known = table[: 1 + REACH, : 1 + REACH]
     taps[: known.shape[0], : known.shape[1]] = known
@@ -151,7 +148,7 @@ def _separated(table: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray
     return rows, columns
 
 
-def smooth_templates(signal_DN: NDArray[np.floating], mask: NDArray[np.bool_], *, kind: str) -> list[Template]:
+def smooth_templates(signal_DN: RealArray, mask: BoolArray, *, kind: str) -> list[Template]:
     """Level, gradients and curvatures across the field, relative to the signal (darks: in DN)."""
     base, unit = np.asarray(signal_DN, dtype=np.float64), "1"
     if kind in ("dark", "afterglow"):
@@ -174,9 +171,7 @@ def smooth_templates(signal_DN: NDArray[np.floating], mask: NDArray[np.bool_], *
     return [level, *(Template("position", name, unit, base * shape) for name, shape in shapes.items())]
 
 
-def transmission_templates(
-    signal_DN: NDArray[np.floating], open_DN: NDArray[np.floating], mask: NDArray[np.bool_]
-) -> list[Template]:
+def transmission_templates(signal_DN: RealArray, open_DN: RealArray, mask: BoolArray) -> list[Template]:
     """Six bins of transmission: the signal where -log T lies in each, relative; the open field apart."""
     log_t = -np.log(np.clip(np.asarray(signal_DN / np.maximum(open_DN, 1e-12), dtype=np.float64), 1e-9, None))
     covered = mask & (log_t > 0.02)
@@ -194,7 +189,7 @@ def transmission_templates(
     return [Template("level", name, "1", np.where(inside, image, 0.0)) for name, inside, image in parts]
 
 
-def edge_templates(signal_DN: NDArray[np.floating]) -> list[Template]:
+def edge_templates(signal_DN: RealArray) -> list[Template]:
     """Displacement, blur along each direction at three scales, ringing, and tails of several lengths."""
     from scipy.ndimage import gaussian_filter, gaussian_filter1d
 

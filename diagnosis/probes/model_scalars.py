@@ -6,9 +6,9 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
+from ..arrays import FloatArray, RealArray
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
 from .fixed_pattern import Pattern, shares_of_pixels, shares_of_tiles
 from .lasting import BY_CHANCE, chance_in_flat, chances
@@ -35,7 +35,7 @@ _LEAST_PATTERN = 1e-3  # of the variance of noise: less noise than expected leav
 
 
 def expected_scalars(
-    expected: ExpectedSeries, context: ScalarContext, *, dark_change_DN: NDArray[np.floating] | float = 0.0
+    expected: ExpectedSeries, context: ScalarContext, *, dark_change_DN: RealArray | float = 0.0
 ) -> dict[str, float]:
     """The scalar probes' values by the forward model, by name; only those that this kind of series has.
 
@@ -70,11 +70,8 @@ def expected_scalars(
     return values
 
 
-def _noise_scalars(expected: ExpectedSeries, context: ScalarContext, profile: NDArray[np.float64]) -> dict[str, float]:
-    """Noise by label and of whole frames: variance, correlation of neighbours, lines, blocks, times and tails.
-
-    profile: change of the mean from frame to frame (n,), DN.
-    """
+def _noise_scalars(expected: ExpectedSeries, context: ScalarContext, profile: FloatArray) -> dict[str, float]:
+    """Variance, correlation, lines, blocks, times and tails of the noise; profile (n,): course of the mean, DN."""
     values: dict[str, float] = {}
     areas = context.areas
     rows, columns = context.good.shape

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
+from ..arrays import FloatArray, IndexArray, RealArray
 from ..session.summaries import LEAST_NOISE_DN2, PIECE_FRAMES
 from .scalar_context import ScalarContext
 
@@ -14,29 +14,22 @@ _KURTOSIS_PIXELS = 2048  # in which a fading picture's is computed
 
 @dataclass(frozen=True, slots=True)
 class MovingPicture:
-    """What a picture that fades from frame to frame adds to variances, once the frames' common factor is taken out.
+    """What a picture that fades from frame to frame adds to variances, once the frames' common factor is taken out."""
 
-    Fields: products: mean product (trend, trend) of the pictures' pixels, of all good pixels and of each label's; lines: the
-    same of the means of rows and of columns; steps (trend, trend): half of the mean product of changes from one frame to the
-    next; courses (trend, frame); order (pixel,): flat indices of some good pixels all over the field; there (trend, pixel): the
-    pictures in these.
-    """
-
-    products: tuple[NDArray[np.float64], ...]
-    lines: tuple[NDArray[np.float64], ...]
-    steps: NDArray[np.float64]
-    courses: NDArray[np.float64]
-    order: NDArray[np.intp]
-    there: NDArray[np.float64]
+    # (trend, trend): mean product of the pictures' pixels, of all good ones and of each label's
+    products: tuple[FloatArray, ...]
+    lines: tuple[FloatArray, ...]  # the same of the means of rows and of columns
+    steps: FloatArray  # (trend, trend): half of the mean product of changes from one frame to the next
+    courses: FloatArray  # (trend, frame)
+    order: IndexArray  # (pixel,): flat indices of some good pixels all over the field
+    there: FloatArray  # (trend, pixel): the pictures in these
 
     @staticmethod
     def of(expected: ExpectedSeries, context: ScalarContext) -> "MovingPicture":
-        if not expected.trend_DN:
-            return _STILL
         good, areas = context.good, context.areas
         changing = [
             (image, np.asarray(course, dtype=np.float64))
-            for image, course in expected.trend_DN
+            for image, course in expected.trend_DN or ()
             if np.size(course) > 1 and float(np.ptp(course)) > 0.0
         ]
         if not changing:
@@ -88,7 +81,7 @@ class MovingPicture:
         if not self.products:
             return 0.0
 
-        def pixels(variance: NDArray[np.floating]) -> NDArray[np.float64]:
+        def pixels(variance: RealArray) -> FloatArray:
             found = np.asarray(variance, dtype=np.float64)
             return found.ravel() if found.size == 1 else found.ravel()[self.order]
 
@@ -129,7 +122,7 @@ def lag_loss(expected: ExpectedSeries) -> float:
     return 1.0 - float(correlation[0]) if correlation.size else 1.0
 
 
-def _mean_product(images: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mean_product(images: FloatArray) -> FloatArray:
     """Mean products (image, image) of images (image, pixel)."""
     return np.asarray(images @ images.T / max(images.shape[1], 1))
 

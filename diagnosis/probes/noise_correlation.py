@@ -3,9 +3,9 @@
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
+from ..arrays import FloatArray
 
 
 def autocovariance(expected: ExpectedSeries, dr: int, dc: int) -> float:
@@ -28,7 +28,7 @@ def _correlation_sum(table: bytes, shape: tuple[int, int], rows: int, columns: i
 
 
 @lru_cache(maxsize=64)
-def _triangle(length: int, lags: int) -> NDArray[np.float64]:
+def _triangle(length: int, lags: int) -> FloatArray:
     """Weights (lags,) of lags to both sides in the variance of a sum of `length` neighbours, over that of one."""
     lag = np.arange(lags)
     return np.asarray(np.where(lag == 0, 1.0, 2.0 * np.maximum(1.0 - lag / length, 0.0)))

@@ -49,19 +49,16 @@ def root_of_count(count: float) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scalar:
-    """A scalar probe: axis, name, unit, measured value, its standard deviation, and the counting noise's part of it.
-
-    Noise of pixels of one label (`noise_name`) says which, and the lag of a correlation; elsewhere they are empty and None.
-    """
+    """A scalar probe."""
 
     axis: str
     name: str
     unit: str
     value: float
-    sd: float
-    sampling_sd: float
-    label: str = ""
-    lag: tuple[int, int] | None = None
+    sd: float  # of the value
+    sampling_sd: float  # the counting noise's part of it
+    label: str = ""  # of the pixels, where it is noise of these (`noise_name`)
+    lag: tuple[int, int] | None = None  # of a correlation
 
 
 def noise_name(label: str, lag: tuple[int, int] | None = None) -> str:

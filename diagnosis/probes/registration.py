@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.spread._fine_picture import FINE
+from ..arrays import BoolArray, FloatArray, RealArray
 from ..session.even_maps import local_range
 
 RENDER_SHARE = 0.1  # of the local range: how well a pixel that an edge cuts is rendered
@@ -27,10 +27,8 @@ _BEYOND_PX = 12  # of a picture's border that its splines hold
 _FAR_SHARES = ((4, 0.01), (12, 0.003))  # (pixels to each side, share)
 SHARP_PX = 0.3  # spread below which a picture's splines ring more than a displacement shows
 _DRAWN_ROUNDS = 6  # of drawing anew
-_DRAWN_STEP_PX, _DRAWN_ENOUGH_PX = (
-    0.03,
-    0.002,
-)  # of differences of drawn pictures; below which a further step changes nothing
+_DRAWN_STEP_PX = 0.03  # of differences of drawn pictures
+_DRAWN_ENOUGH_PX = 0.002  # step below which a further one changes nothing
 _LARGEST_STEP_PX = 0.25
 _SAME_SLOPES_PX = 0.1  # step after which slopes are drawn anew
 _WORTH_A_CELL = 0.98  # share of what is left from which a step further on helps
@@ -54,15 +52,13 @@ class Placement:
         return min(self.row_sd_px, self.column_sd_px) < SEEN_PX
 
 
-def gradient(image: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def gradient(image: RealArray) -> tuple[FloatArray, FloatArray]:
     """Slopes along rows and along columns (row, column), a pixel."""
     along_rows, along_columns = np.gradient(np.asarray(image, dtype=np.float64))
     return np.asarray(along_rows, dtype=np.float64), np.asarray(along_columns, dtype=np.float64)
 
 
-def render_variance(
-    signal_DN: NDArray[np.floating], *, far: bool = True, side: int = 1, cut: float = RENDER_SHARE
-) -> NDArray[np.float64]:
+def render_variance(signal_DN: RealArray, *, far: bool = True, side: int = 1, cut: float = RENDER_SHARE) -> FloatArray:
     """Variance (row, column), DN^2, with which pixels at edges are rendered from thickness maps and blur.
 
     far: in the shadow beside an edge the noise is so low that the far end of a blur, which no law has right, would outweigh all
@@ -75,7 +71,7 @@ def render_variance(
     return np.asarray(result**2, dtype=np.float64)
 
 
-def without_border(mask: NDArray[np.bool_], margin_px: int = 3) -> NDArray[np.bool_]:
+def without_border(mask: BoolArray, margin_px: int = 3) -> BoolArray:
     """The mask (row, column) less its outermost pixels."""
     inner = (slice(margin_px, -margin_px),) * 2
     left = np.zeros_like(mask)
@@ -83,7 +79,7 @@ def without_border(mask: NDArray[np.bool_], margin_px: int = 3) -> NDArray[np.bo
     return left
 
 
-def fill(image: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+def fill(image: RealArray, mask: BoolArray) -> FloatArray:
     """The image with pixels outside the mask taken from the median of their neighbours."""
     if mask.all():
         return np.asarray(image, dtype=np.float64)
@@ -93,19 +89,19 @@ def fill(image: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[np.flo
     return rough
 
 
-def _splines(image: NDArray[np.float64]) -> NDArray[np.float64]:
+def _splines(image: FloatArray) -> FloatArray:
     """Coefficients of the cubic splines through a picture that goes on beyond its borders as it ends there."""
     from scipy.ndimage import spline_filter
 
     return np.asarray(spline_filter(np.pad(image, _BEYOND_PX, mode="edge"), order=3, mode="nearest"), dtype=np.float64)
 
 
-def resample(image: NDArray[np.floating], placement: Placement) -> NDArray[np.float64]:
+def resample(image: RealArray, placement: Placement) -> FloatArray:
     """The measured picture brought to where the thickness maps are (cubic splines)."""
     return _resampled(_splines(np.asarray(image, dtype=np.float64)), placement)
 
 
-def _resampled(splines: NDArray[np.float64], placement: Placement) -> NDArray[np.float64]:
+def _resampled(splines: FloatArray, placement: Placement) -> FloatArray:
     """The measured picture (row, column) brought to where the thickness maps are, from its splines' coefficients."""
     for along in (placement.row_px, placement.column_px):
         whole = math.floor(along)
@@ -125,23 +121,16 @@ def _resampled(splines: NDArray[np.float64], placement: Placement) -> NDArray[np
 
 
 def register(
-    measured: Sequence[NDArray[np.floating]],
-    expected: Sequence[NDArray[np.floating]],
-    variance: Sequence[NDArray[np.floating]],
-    mask: NDArray[np.bool_],
+    measured: Sequence[RealArray], expected: Sequence[RealArray], variance: Sequence[RealArray], mask: BoolArray
 ) -> Placement:
     """Placement of a scene from the pictures of all its series: Gauss-Newton, level and smooth light left free.
 
-    A displacement has a standard deviation of one pixel along either side before looking.
-
-    Args:
-        measured, expected: signals (row, column), DN, of each series.
-        variance: of the measured ones.
-        mask: pixels to use; the outermost three are left out.
+    A displacement has a standard deviation of one pixel along either side before looking. measured, expected: signals (row, column),
+    DN, of each series; variance: of the measured ones; mask: pixels to use, but for the outermost three.
     """
     inner = without_border(mask)
     current = np.zeros(2)
-    covariance: NDArray[np.float64] = np.eye(2)
+    covariance: FloatArray = np.eye(2)
     splines = [_splines(fill(image, mask)) for image in measured]
     models = [np.asarray(model, dtype=np.float64) for model in expected]
     slopes = [np.stack(gradient(model))[:, inner] for model in models]
@@ -171,18 +160,9 @@ def register(
 
 
 def left_over(
-    measured: Sequence[NDArray[np.floating]],
-    expected: Sequence[NDArray[np.floating]],
-    mask: NDArray[np.bool_],
-    placement: Placement,
+    measured: Sequence[RealArray], expected: Sequence[RealArray], mask: BoolArray, placement: Placement
 ) -> float:
-    """Sum of the squares that pictures leave of measured ones at a placement, levels free, each over its highest signal squared.
-
-    Args:
-        measured, expected: signals (row, column), DN, of each series.
-        mask: pixels to use.
-        placement: where the scene is taken to lie.
-    """
+    """Sum of the squares that pictures leave of measured ones (row, column), levels free, each over its highest signal squared."""
     total = 0.0
     for image, model in zip(measured, expected, strict=True):
         picture, level = resample(fill(image, mask), placement)[mask], np.asarray(model, dtype=np.float64)[mask]
@@ -195,10 +175,10 @@ def left_over(
 
 
 def register_drawn(
-    measured: Sequence[NDArray[np.floating]],
-    draw: Callable[[tuple[float, float]], Sequence[NDArray[np.floating]]],
-    variance: Sequence[NDArray[np.floating]],
-    mask: NDArray[np.bool_],
+    measured: Sequence[RealArray],
+    draw: Callable[[tuple[float, float]], Sequence[RealArray]],
+    variance: Sequence[RealArray],
+    mask: BoolArray,
     start: Placement,
     *,
     whole_cells: bool,
@@ -222,11 +202,11 @@ def register_drawn(
     images = [fill(image, mask) for image in measured]
     blur_px = _SHARP_BLUR_PX if whole_cells else 0.0
 
-    def drawn(at: tuple[float, float]) -> list[NDArray[np.float64]]:
-        pictures = [np.asarray(model, dtype=np.float64) for model in draw(at)]
+    def drawn(at: FloatArray) -> list[FloatArray]:
+        pictures = [np.asarray(model, dtype=np.float64) for model in draw((float(at[0]), float(at[1])))]
         return [gaussian_filter(one, blur_px) for one in pictures] if blur_px else pictures
 
-    models = drawn((0.0, 0.0))
+    models = drawn(np.zeros(2))
     # every pixel alike: with the noise of the shadow, or with edges taken as doubtful, a blur that the twin does not know
     # would pull an edge away; doubts of rendering are those that any number of series share
     doubts = [render_variance(model, far=False) / RENDER_SHARE**2 for model in models]
@@ -244,7 +224,7 @@ def register_drawn(
 
     def left(step: tuple[int, int]) -> float:
         if step not in known:
-            known[step] = fit.of(drawn((step[0] / parts, step[1] / parts)))
+            known[step] = fit.of(drawn(np.array(step) / parts))
         return known[step]
 
     most = round(LARGEST_PX * parts)
@@ -260,13 +240,13 @@ def register_drawn(
         sds = np.maximum([start.row_sd_px, start.column_sd_px], CELL_SD_PX)
         return _placement(current, np.diag(sds**2))
     current = np.array(step) / FINE
-    models = drawn((float(current[0]), float(current[1])))
+    models = drawn(current)
     rest = fit.of(models)
-    covariance: NDArray[np.float64] = np.eye(2)
-    slopes: list[NDArray[np.float64]] = []
+    covariance: FloatArray = np.eye(2)
+    slopes: list[FloatArray] = []
     for _ in range(_DRAWN_ROUNDS):
         if not slopes:
-            moved = [drawn((float(at[0]), float(at[1]))) for at in current + _DRAWN_STEP_PX * np.eye(2)]
+            moved = [drawn(at) for at in current + _DRAWN_STEP_PX * np.eye(2)]
             slopes = [
                 np.stack([one - model for one in pair])[:, inner] / _DRAWN_STEP_PX
                 for model, *pair in zip(models, *moved, strict=True)
@@ -276,7 +256,7 @@ def register_drawn(
         onward = np.clip(inverse @ right, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
         for part in (1.0, 0.4, 0.1):
             there = np.clip(current + part * onward, -LARGEST_PX, LARGEST_PX)
-            pictures = drawn((float(there[0]), float(there[1])))
+            pictures = drawn(there)
             after = fit.of(pictures)
             if after < rest:
                 break
@@ -291,11 +271,8 @@ def register_drawn(
     return _placement(current, covariance)
 
 
-def _vertex(left: Callable[[tuple[int, int]], float], step: tuple[int, int]) -> NDArray[np.float64]:
-    """Where beside a whole displacement (2,), px, a parabola through what whole pixels around it leave is least.
-
-    Between pixels a picture would be drawn less sharply. A measured one that is blurred would be sought there, wherever it lies.
-    """
+def _vertex(left: Callable[[tuple[int, int]], float], step: tuple[int, int]) -> FloatArray:
+    """Where beside a whole displacement (2,), px, a parabola through what whole pixels around it leave is least."""
     around = np.array([[left((step[0] + row, step[1] + column)) for column in (-1, 0, 1)] for row in (-1, 0, 1)])
     cross = 0.25 * (around[2, 2] - around[2, 0] - around[0, 2] + around[0, 0])
     curved = np.array(
@@ -316,31 +293,23 @@ def _vertex(left: Callable[[tuple[int, int]], float], step: tuple[int, int]) -> 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _LeftOver:
-    """What pictures leave of measured ones, level and smooth light left free.
+    """What pictures leave of measured ones, level and smooth light left free."""
 
-    Fields: images, measured (row, column); inner, pixels that count (row, column); weights of the pixels of each image; away:
-    weights with which light that strays is seen, as `_away` has them.
-    """
+    images: Sequence[FloatArray]  # measured (row, column)
+    inner: BoolArray  # pixels that count (row, column)
+    weights: Sequence[float]  # of the pixels of each image
+    away: Sequence[tuple[FloatArray, FloatArray]]  # see `_away`
 
-    images: Sequence[NDArray[np.float64]]
-    inner: NDArray[np.bool_]
-    weights: Sequence[float]
-    away: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
-
-    def _each(
-        self, models: Sequence[NDArray[np.float64]]
-    ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float]]:
+    def _each(self, models: Sequence[FloatArray]) -> Iterator[tuple[FloatArray, FloatArray, float]]:
         """Residual, level (pixel,) and weight of each image."""
         for image, model, weight, away in zip(self.images, models, self.weights, self.away, strict=True):
             yield *_left(image, model, inner=self.inner, weight=weight, away=away), weight
 
-    def of(self, models: Sequence[NDArray[np.float64]]) -> float:
+    def of(self, models: Sequence[FloatArray]) -> float:
         """Sum of squares."""
         return sum(weight * float(residual @ residual) for residual, _, weight in self._each(models))
 
-    def slope(
-        self, models: Sequence[NDArray[np.float64]], slopes: Sequence[NDArray[np.float64]]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def slope(self, models: Sequence[FloatArray], slopes: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """The sum of `_slope` over all pictures, for slopes (2, pixel) of each."""
         each = zip(self._each(models), slopes, strict=True)
         found = [_slope(residual, level, design, weight) for (residual, level, weight), design in each]
@@ -349,17 +318,14 @@ class _LeftOver:
 
 
 def _left(
-    picture: NDArray[np.float64],
-    model: NDArray[np.float64],
+    picture: FloatArray,
+    model: FloatArray,
     *,
-    inner: NDArray[np.bool_],
-    weight: NDArray[np.float64] | float,
-    away: tuple[NDArray[np.float64], NDArray[np.float64]],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What a model leaves of a picture in the inner pixels, level and smooth light left free, and its level there, each (pixel,).
-
-    picture, model, inner (row, column); weight (pixel,), or one for all; away: see `_away`.
-    """
+    inner: BoolArray,
+    weight: FloatArray | float,
+    away: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """What a model leaves of a picture in the inner pixels, level and smooth light left free, and its level there, each (pixel,)."""
     level = model[inner]
     weighed = weight * level
     power = float(weighed @ level) + 1e-30
@@ -370,26 +336,17 @@ def _left(
 
 
 def _slope(
-    residual: NDArray[np.float64],
-    level: NDArray[np.float64],
-    design: NDArray[np.float64],
-    weight: NDArray[np.float64] | float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Normal matrix (2, 2) and right side (2,) of the step that leaves least, the level left free.
-
-    residual, level: see `_left`; design: slopes of the picture (2, pixel).
-    """
+    residual: FloatArray, level: FloatArray, design: FloatArray, weight: FloatArray | float
+) -> tuple[FloatArray, FloatArray]:
+    """Normal matrix (2, 2) and right side (2,) of the step that leaves least, the level free; design: slopes (2, pixel)."""
     weighed = weight * design
     cross = weighed @ level
     normal = weighed @ design.T - np.outer(cross, cross) / (float((weight * level) @ level) + 1e-30)
     return normal, np.asarray(weighed @ residual)
 
 
-def _inverse(normal: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What makes of a right side a step, and the step's covariance, each (2, 2), with a prior of one pixel to either side.
-
-    Along a single edge nothing shows the displacement: a weak direction stays where it is, as uncertain as the prior has it.
-    """
+def _inverse(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What makes of a right side a step, 0 along a weak direction, and its covariance, each (2, 2), with a prior of one pixel."""
     values, vectors = np.linalg.eigh(normal)
     weak = values < _WEAK * values[-1]
     inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0))
@@ -397,23 +354,21 @@ def _inverse(normal: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     return step, covariance
 
 
-def _away(weight: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _away(weight: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Weights (row, column) of pixels away from edges, and their smooth sum."""
     from scipy.ndimage import gaussian_filter
 
     return weight, np.maximum(gaussian_filter(weight, _STRAY_PX, mode="constant"), 1e-30)
 
 
-def _stray(
-    residual: NDArray[np.float64], weight: NDArray[np.float64], total: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _stray(residual: FloatArray, weight: FloatArray, total: FloatArray) -> FloatArray:
     """The smooth part of a residual, as pixels away from edges show it; weight, total: see `_away`."""
     from scipy.ndimage import gaussian_filter
 
     return np.asarray(gaussian_filter(weight * residual, _STRAY_PX, mode="constant") / total)
 
 
-def _placement(values: NDArray[np.float64], covariance: NDArray[np.float64]) -> Placement:
+def _placement(values: FloatArray, covariance: FloatArray) -> Placement:
     sds = np.sqrt(np.diag(covariance) + 1e-3**2)  # none is known better than that
     return Placement(
         row_px=float(values[0]), column_px=float(values[1]), row_sd_px=float(sds[0]), column_sd_px=float(sds[1])

@@ -13,9 +13,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.spread._fine_picture import area_beyond
+from ..arrays import BoolArray, FloatArray, RealArray
 
 _BINS_A_PX = 4
 _NEAR_PX = 3.0  # from the border
@@ -29,19 +29,15 @@ _ROUND_PX = 0.6  # from the border, beyond which no pixel of a disc's map is on 
 
 @dataclass(frozen=True, slots=True)
 class _Border:
-    """A straight border that crosses lines of pixels.
+    """A straight border that crosses lines of pixels."""
 
-    Fields: away_px: distance of each pixel from it (row, column), px, to either side; slope: pixels that it goes on from line to
-    line; behind: sign of the distances where the object is; lines: how many it crosses.
-    """
-
-    away_px: NDArray[np.float64]
-    slope: float
-    behind: float
-    lines: int
+    away_px: FloatArray  # (row, column): distance of each pixel from it, to either side
+    slope: float  # pixels that it goes on from line to line
+    behind: float  # sign of the distances where the object is
+    lines: int  # how many it crosses
 
 
-def distance_px(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[np.float64] | None:
+def distance_px(thickness_mm: Mapping[str, RealArray]) -> FloatArray | None:
     """Distance of each pixel (row, column) from the border of a straight edge, px, to either side; None: there is no such edge.
 
     thickness_mm: maps (row, column), by material.
@@ -50,9 +46,7 @@ def distance_px(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[np.
     return None if border is None else border.away_px
 
 
-def covered_scene(
-    kind: str | None, thickness_mm: Mapping[str, NDArray[np.floating]]
-) -> dict[str, NDArray[np.floating]] | None:
+def covered_scene(kind: str | None, thickness_mm: Mapping[str, RealArray]) -> dict[str, RealArray] | None:
     """Maps (row, column) of the same scene with pixels as thick as the share of them that it covers.
 
     None where the scene is of another kind than `edge` or `disc`, or its border neither straight nor round.
@@ -64,7 +58,7 @@ def covered_scene(
     return {name: (covered * float(np.max(image))).astype(np.float32)}
 
 
-def _behind_line(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[np.float64] | None:
+def _behind_line(thickness_mm: Mapping[str, RealArray]) -> FloatArray | None:
     """Covered share of each pixel (row, column) of a straight edge."""
     border = _border(thickness_mm)
     if border is None:
@@ -74,7 +68,7 @@ def _behind_line(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[np
     return area_beyond(-border.behind * border.away_px, long, short)
 
 
-def _within_circle(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[np.float64] | None:
+def _within_circle(thickness_mm: Mapping[str, RealArray]) -> FloatArray | None:
     """Covered share of each pixel (row, column) of a round disc that lies whole in the field."""
     share = _of_the_thickest(thickness_mm)
     if share is None:
@@ -91,7 +85,7 @@ def _within_circle(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[
     return area_beyond(away, np.maximum(sides.max(axis=0), 1e-4), np.maximum(sides.min(axis=0), 1e-4))
 
 
-def _of_the_thickest(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArray[np.float64] | None:
+def _of_the_thickest(thickness_mm: Mapping[str, RealArray]) -> FloatArray | None:
     """The map of a scene of one material (row, column), over its largest value; None of any other scene."""
     if len(thickness_mm) != 1:
         return None
@@ -100,7 +94,7 @@ def _of_the_thickest(thickness_mm: Mapping[str, NDArray[np.floating]]) -> NDArra
     return image / most if most > 0.0 else None
 
 
-def _border(thickness_mm: Mapping[str, NDArray[np.floating]]) -> _Border | None:
+def _border(thickness_mm: Mapping[str, RealArray]) -> _Border | None:
     share = _of_the_thickest(thickness_mm)
     if share is None:
         return None
@@ -110,7 +104,7 @@ def _border(thickness_mm: Mapping[str, NDArray[np.floating]]) -> _Border | None:
     return replace(across_columns, away_px=across_columns.away_px.T)
 
 
-def _across_rows(covered: NDArray[np.float64]) -> _Border | None:
+def _across_rows(covered: FloatArray) -> _Border | None:
     """The border of an edge (row, column), covered share, that rows cross; None: they cross none, or no straight one."""
     rows, columns = covered.shape
     behind = covered.sum(axis=1)
@@ -129,19 +123,10 @@ def _across_rows(covered: NDArray[np.float64]) -> _Border | None:
     return _Border(away, float(slope), -1.0 if left else 1.0, int(np.count_nonzero(crossed)))
 
 
-def scatter_share(
-    residual_DN: NDArray[np.floating],
-    range_DN: NDArray[np.floating],
-    mask: NDArray[np.bool_],
-    away_px: NDArray[np.float64],
-) -> float:
+def scatter_share(residual_DN: RealArray, range_DN: RealArray, mask: BoolArray, away_px: FloatArray) -> float:
     """What pixels at one distance from a straight edge differ by, noise as well: rms over the local range of the picture, no unit.
 
-    Args:
-        residual_DN: of the mean frame (row, column).
-        range_DN: of the expected picture within a pixel or so (row, column).
-        mask: pixels that are compared.
-        away_px: see `distance_px`.
+    residual_DN, range_DN, mask, away_px (row, column): of the mean frame, of the expected picture, compared pixels, `distance_px`.
     """
     near = mask & (np.abs(away_px) < _NEAR_PX)
     values, ranges = np.asarray(residual_DN[near], np.float64), np.asarray(range_DN[near], np.float64)
@@ -150,7 +135,7 @@ def scatter_share(
     if values.size <= 3 * len(counts):
         return math.inf
 
-    def about_means(of: NDArray[np.float64]) -> NDArray[np.float64]:
+    def about_means(of: FloatArray) -> FloatArray:
         return np.asarray(of - (np.bincount(number, weights=of) / counts)[number])
 
     # within a bin a profile is a straight line

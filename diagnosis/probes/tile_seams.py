@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.line.line_state import Seams
+from ..arrays import BoolArray, FloatArray, RealArray
 from ..session.summaries import BLOCK_PX
 
 _BESIDE_PX = 4  # lines whose mean is taken, two means to either side of a border
@@ -35,16 +35,8 @@ class SeenSeams:
         return self.rows.side_px > 0.0 or self.columns.side_px > 0.0
 
 
-def seams_in(
-    changes: Sequence[NDArray[np.floating]], weights: Sequence[float], clean: NDArray[np.bool_]
-) -> SeenSeams | None:
-    """The seams that relative changes of flats (row, column) show, those of all together; None: there is no flat.
-
-    Args:
-        changes: measured over expected, less 1, of each flat.
-        weights: of each.
-        clean: pixels in use that do not stand out (row, column).
-    """
+def seams_in(changes: Sequence[RealArray], weights: Sequence[float], clean: BoolArray) -> SeenSeams | None:
+    """The seams that relative changes of flats (row, column), measured over expected less 1, show together; None: no flat."""
     if not changes:
         return None
     change = np.average(np.stack([np.asarray(one, dtype=np.float64) for one in changes]), axis=0, weights=weights)
@@ -54,7 +46,7 @@ def seams_in(
     return SeenSeams(rows=rows, columns=columns, log_prior=-math.log(tried))
 
 
-def _along(change: NDArray[np.float64], clean: NDArray[np.bool_]) -> tuple[Seams, int]:
+def _along(change: FloatArray, clean: BoolArray) -> tuple[Seams, int]:
     """Seams between columns whose steps are the likeliest, none where all may be chance; how many choices there were."""
     squares, stretches = _steps(change, clean)
     border = np.arange(2 * _BESIDE_PX, 2 * _BESIDE_PX + len(squares))
@@ -73,11 +65,8 @@ def _along(change: NDArray[np.float64], clean: NDArray[np.bool_]) -> tuple[Seams
     return (best, tried) if most > math.log(max(tried, 1)) else (Seams(), tried)
 
 
-def _steps(change: NDArray[np.float64], clean: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
-    """Square of the step at each border that has lines enough beside it (border,), over the usual one, and of how many it is worth.
-
-    Where too few pixels beside a border are clean it is 1.
-    """
+def _steps(change: FloatArray, clean: BoolArray) -> tuple[FloatArray, float]:
+    """Square of the step at each border (border,) over the usual one, 1 where few pixels are clean, and of how many it is worth."""
     rows = len(change) // BLOCK_PX
     stacked = (rows, BLOCK_PX, change.shape[1])
     known = clean[: rows * BLOCK_PX].reshape(stacked).sum(axis=1)

@@ -4,52 +4,30 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import AppliedEffect
+from ..arrays import BoolArray, FloatArray
 from ..model.changes import Change, Variant
 from ..model.curves import LEAST_RESPONSE, places_of
 from ..model.forward_model import strength_rows
 from ..model.responses import Asked, SessionModel
 from ..session.even_maps import full_size
 from .nuisance_columns import Columns, nuisances_of_series
-from .other_scenes import OtherScenes
-from .series_probes import SeriesProbes
+from .series_block import SeriesBlock
 from .surroundings import border_inflow
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ProbedSeries:
-    """One series as the base twin expects it, and what its numbers are.
-
-    Fields: probes; signal_DN (row, column): expected, corrected; scenes: what may stand in its scene's place.
-    """
-
-    probes: SeriesProbes
-    signal_DN: NDArray[np.floating]
-    scenes: OtherScenes
-
-    def __len__(self) -> int:
-        return len(self.probes)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class AskedAgain:
-    """A session's forward model and the probes of its series.
-
-    Fields: session; series, in order of time; steps: of nuisances that lie in the twin; done (probe,): what the base's own effects
-    do, by id; factors (probe,): nuisances of the base, by name.
-    """
+    """A session's forward model and the probes of its series."""
 
     session: SessionModel
-    series: tuple[ProbedSeries, ...]
-    steps: tuple[Change, ...]
-    done: Mapping[str, NDArray[np.float64]]
-    factors: Columns
+    series: tuple[SeriesBlock, ...]  # in order of time
+    steps: tuple[Change, ...]  # of nuisances that lie in the twin
+    done: Mapping[str, FloatArray]  # (probe,): what the base's own effects do, by id
+    factors: Columns  # (probe,): nuisances of the base, by name
 
-    def respond(
-        self, variants: Sequence[Variant], wanted: NDArray[np.bool_] | None = None
-    ) -> dict[int, NDArray[np.float64]]:
+    def respond(self, variants: Sequence[Variant], wanted: BoolArray | None = None) -> dict[int, FloatArray]:
         """Responses (strength, probe) of further variants, by their place among them; failed ones are left out.
 
         Series without any of the probes that are wanted (probe,) are not asked: their probes are 0.
@@ -63,15 +41,11 @@ class AskedAgain:
         asked = [self.session.ask(change) for change in (*changes, *(model.with_found([item]) for item in there))]
         responses = np.zeros((len(asked), sum(map(len, self.series))))
         for one, place in zip(self.series, places_of(self.series), strict=True):
-            if wanted is not None and not wanted[place].any():
-                continue
-            found = enumerate(self.session.moved(one.probes.series, asked))
-            moved = {row: item for row, item in found if item is not None}
-            if moved:
-                responses[list(moved), place] = one.probes.responses(list(moved.values()))
+            if wanted is None or wanted[place].any():
+                responses[:, place] = one.probes.responses(self.session.moved(one.probes.series, asked))
         names = np.repeat([one.probes.series.name for one in self.series], [len(one) for one in self.series])
 
-        def of(variant: Variant, rows: slice) -> NDArray[np.float64]:
+        def of(variant: Variant, rows: slice) -> FloatArray:
             found = responses[rows] + self.done.get(variant.effect, 0.0)
             if variant.beside is not None:
                 found = found - responses[len(changes) + there.index(variant.beside)]
@@ -83,7 +57,7 @@ class AskedAgain:
             if not any(one.failed for one in (*asked[rows], *asked[len(changes) :]))
         }
 
-    def border_inflow(self, effect: AppliedEffect) -> NDArray[np.float64] | None:
+    def border_inflow(self, effect: AppliedEffect) -> FloatArray | None:
         """What borders may let in of an effect by chance, see `border_inflow`."""
         return border_inflow(self.session, [one.probes for one in self.series], effect)
 
@@ -105,7 +79,7 @@ class AskedAgain:
                 columns.setdefault(name, np.zeros(len(next(iter(columns.values())))))[place] = column
         return notable(columns)
 
-    def _of_series(self, one: ProbedSeries, found: Asked, asked: Mapping[str, Asked]) -> Columns:
+    def _of_series(self, one: SeriesBlock, found: Asked, asked: Mapping[str, Asked]) -> Columns:
         """Responses (probe,) of one series to nuisances; none where the effects do not change what it shows."""
         at, *others = self.session.moved(one.probes.series, [found, *asked.values()])
         if at is None or not np.any(one.probes.responses([at])):

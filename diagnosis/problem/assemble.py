@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...acquisition.acquisition_io import AcquisitionFile, Series
 from ...acquisition.log_images import light_of_shares
@@ -13,6 +12,7 @@ from ...errors import InputError
 from ...generator.effects import EFFECTS, AppliedEffect, effect_of
 from ...generator.frames.conditions import beam_conditions, session_conditions, with_conditions
 from ...generator.line.twin import Twin
+from ..arrays import FloatArray, IndexArray
 from ..inference.discrepancy import FARTHEST_LEVEL, USUAL_LEVEL
 from ..inference.observed import Point
 from ..inference.unknown import Families
@@ -34,19 +34,17 @@ from ..model.forward_model import ForwardModel, draft_cache, own_maps, strength_
 from ..model.placing import MeasuredScenes, place_scenes
 from ..model.responses import Asked, SeriesModel, SessionModel, session_model
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, OUTLIERS_ANYWHERE, ProbeName
-from ..probes.tile_seams import SeenSeams, seams_in
-from ..session.even_maps import Map, mean_over, signal_map
+from ..session.even_maps import Map
 from ..session.preparation import PreparedSession
 from ..session.session import SessionSeries, only_own_noise, read_session
-from ..session.summaries import SeriesSummary
-from ..session.usable import SeenSeries, counted_copies, look_at_all, stated_series, summarise_all
-from .asked_again import AskedAgain, ProbedSeries, notable
+from ..session.usable import counted_copies, look_at_all, stated_series, summarise_all
+from .asked_again import AskedAgain, notable
 from .line_noise import usual_line_noise
 from .nuisance_columns import Columns, nuisances_of_series
 from .other_scenes import NO_SCENES, OtherScenes, other_scenes
-from .problem import Problem, SeriesView, read_exactly
+from .problem import Problem, read_exactly
 from .series_block import SeriesBlock, by_chance, jitter_of, series_block
-from .series_probes import MeanFrame, mean_frame, series_probes
+from .series_probes import MeasuredSession, mean_frame, series_probes
 from .surroundings import border_inflow
 
 _Key = TypeVar("_Key", bound=Hashable)
@@ -65,23 +63,19 @@ def build_problem(
     calibrated_elsewhere: bool = False,
     exposed: Sequence[Series] = (),
     ends_at_zero: frozenset[str] = frozenset(),
-    spectral_point: NDArray[np.float64] | None = None,
+    spectral_point: FloatArray | None = None,
     side: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> Problem:
-    """Probes, nuisances and effect responses of a session.
+    """Probes, nuisances and responses to effects (variants) of a session.
 
     Args:
-        acquisition: open file.
-        twin: calibrated from this session's calibrating series, or from another session; effects that it has are no gap.
-        variants: effects to try.
-        calibrated_elsewhere: the twin comes from another session (dark and gain maps from the twin unless series here are
-            marked as calibrating).
-        exposed, ends_at_zero: as in `read_session`.
+        acquisition, exposed, ends_at_zero: open file, and as in `read_session`.
+        twin: calibrated from this session or, with `calibrated_elsewhere`, another; its effects are no gap, its dark and gain maps
+            stand in where no series here is marked as calibrating.
         spectral_point: spectral parameters (parameter,) at which these nuisances are taken as linear in place of the best ones,
             about which they have their priors all the same.
         side: of the squares of the panel's pixels that the acquisition has for pixels.
-        progress: called with the name of each stage.
 
     Raises:
         InputError: nothing that can be judged: no darks and flats, or another detector than the twin's.
@@ -107,39 +101,36 @@ def build_problem(
     variants = with_seams(variants, measured.seams())
     tell("responses")
     changes = [model.change(variant, strength) for variant in variants for strength in variant.strengths]
-    steps = _steps_in_twin(model, spectral_steps=_NEAR_A_POINT if back else 1.0, side=side)
-    changes += steps
     had = {item.id: item for item in model.base.effects}
+    steps = twin_changes(model.base, spectral_steps=_NEAR_A_POINT if back else 1.0)
+    little = [item for item in always_a_little(side=side) if item.effect not in had]
+    steps += [replace(model.change(item, item.strengths[0]), label=item.name) for item in little]
+    changes += steps
     changes += [model.without(effect) for effect in had]
-    unjudged = _of_quanta() if only_own_noise(session) else {}
+    unjudged = {}
+    if only_own_noise(session):
+        # effects on the statistics of quanta cannot be judged from the noise that calibrates
+        unjudged = {effect.id: _OWN_NOISE for effect in EFFECTS.values() if effect.stage == "quanta"}
     compared = _Compared(
         measured=measured,
         asked=tuple(expected.ask(change, refused=unjudged.get(change.label, "")) for change in changes),
         had=had,
         variants=tuple(variants),
-        steps=steps,
+        steps=tuple(steps),
         scenes=other_scenes(expected.series),
         back=back,
         side=side,
     )
-    parts = []
+    blocks = []
     for one in expected.series:
         tell(f"responses of {one.name}")
-        parts.append(compared.part(one))
-    return _joined(parts, compared)
+        blocks.append(compared.block(one))
+    return _joined(blocks, compared)
 
 
 def known_by_law(effects: Sequence[AppliedEffect]) -> tuple[AppliedEffect, ...]:
     """Effects of a twin that are part of what is expected; others are sought again, and take the place of those it has."""
     return tuple(item for item in effects if effect_of(item).variation.random not in _IN_NO_LAW)
-
-
-def _steps_in_twin(model: ForwardModel, *, spectral_steps: float, side: int) -> tuple[Change, ...]:
-    """Changes of nuisances that lie in the twin; spectral_steps: as in `twin_changes`."""
-    had = {item.id for item in model.base.effects}
-    fitted = twin_changes(model.base, spectral_steps=spectral_steps)
-    little = [item for item in always_a_little(side=side) if item.effect not in had]
-    return *fitted, *(replace(model.change(item, item.strengths[0]), label=item.name) for item in little)
 
 
 def problem_of(
@@ -163,39 +154,6 @@ def problem_of(
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Measured:
-    """What the frames of a session show, and what the base twin expects of them.
-
-    Fields: expected; pictures (row, column): corrected mean frames, DN, by name of series; summaries of the frames' noise, by name;
-    memory: of outlying pixels in darks, see `memory_of`, by name; copies: of frames, by name of the series that counts them; clean:
-    pixels in use that do not stand out (row, column); lasting (row, column): pixels whose level lasts in a later dark; outliers: how
-    many others stand out in any series; skipped: what could not be used
-    and why.
-    """
-
-    expected: SessionModel
-    pictures: Mapping[str, NDArray[np.float64]]
-    summaries: Mapping[str, SeriesSummary]
-    memory: Mapping[str, tuple[float, int] | None]
-    copies: Mapping[str, int]
-    clean: NDArray[np.bool_]
-    lasting: NDArray[np.bool_]
-    outliers: int
-    skipped: tuple[str, ...]
-
-    def seams(self) -> SeenSeams | None:
-        """Where flats that came after calibration show that tiles meet; None: there is none."""
-        changes, weights = [], []
-        for one in self.expected.series:
-            if one.session.series.kind == "flat" and not one.session.calibrates:
-                signal = signal_map(one.expected, self.clean.shape)
-                changes.append(self.pictures[one.name] / signal - 1.0)
-                variance = mean_over(one.expected.quantum_variance_DN2 + one.expected.white_variance_DN2, self.clean)
-                weights.append(self.summaries[one.name].frames * mean_over(signal, self.clean) ** 2 / variance)
-        return seams_in(changes, weights, self.clean)
-
-
 def _measured(
     session: Sequence[SessionSeries],
     acquisition: AcquisitionFile,
@@ -204,14 +162,33 @@ def _measured(
     *,
     side: int,
     tell: Callable[[str], None],
-) -> _Measured:
-    """Two passes over the frames: which pixels and series can be used, then what these say; scenes are found in between.
-
-    Raises:
-        InputError: no series that can be compared.
-    """
+) -> MeasuredSession:
+    """Two passes over the frames: which pixels and series can be used, then what these say; scenes are found in between."""
+    stated, skipped = stated_series(session, acquisition)
+    tell("expectation")
+    expected = {}
+    for item in stated:
+        try:
+            expected[item.name] = model.expect(item.request)
+        except InputError as error:
+            skipped.append(f"{item.name}: {error}")
+    if not expected:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received="; ".join(skipped) or "no series",
+            expected="darks and flats whose kV, exposure and tube load are stated",
+        )
+    tell("frames")
     known_good = twin.maps.bad_pixels == 0
-    seen, skipped = _seen_series(session, acquisition, model, good=known_good, side=side, tell=tell)
+    seen, left_out = look_at_all(
+        [_as_light(item, model) for item in stated if item.name in expected],
+        expected,
+        good=known_good,
+        bits=acquisition.instrument.bits,
+        dark_at=model.base.maps.dark_at,
+        side=side,
+        tell=tell,
+    )
     maps = calibrated_maps(seen, twin=twin, good=known_good)
     standing_out = new_outliers(seen, maps, counting=bool(model.base.instrument.counting))
     lasting = lasting_anywhere(seen, maps.good)
@@ -227,7 +204,7 @@ def _measured(
     pictures = {one.name: maps.corrected(one.session, one.look.mean_DN) for one in seen}
     scenes = MeasuredScenes(pictures=pictures, clean=clean, sharp=model.sharp, expect=model.expect)
     placed = place_scenes(seen, scenes)
-    return _Measured(
+    return MeasuredSession(
         expected=session_model(model, maps, placed, summaries, clean, lines_DN2=lines_DN2),
         pictures=pictures,
         summaries=summaries,
@@ -236,45 +213,8 @@ def _measured(
         clean=clean,
         lasting=lasting,
         outliers=int(np.count_nonzero(outlying)),
-        skipped=tuple(skipped),
+        skipped=(*skipped, *left_out),
     )
-
-
-def _seen_series(
-    session: Sequence[SessionSeries],
-    acquisition: AcquisitionFile,
-    model: ForwardModel,
-    *,
-    good: NDArray[np.bool_],
-    side: int,
-    tell: Callable[[str], None],
-) -> tuple[list[SeenSeries], list[str]]:
-    """Series that the base twin can be compared with and a first look at their frames, and why others cannot be.
-
-    Raises:
-        InputError: there are none.
-    """
-    stated, skipped = stated_series(session, acquisition)
-    tell("expectation")
-    expected, refused = model.expect_all(stated)
-    skipped += refused
-    if not expected:
-        raise InputError(
-            f"acquisition {acquisition.path}",
-            received="; ".join(skipped) or "no series",
-            expected="darks and flats whose kV, exposure and tube load are stated",
-        )
-    tell("frames")
-    seen, left_out = look_at_all(
-        [_as_light(item, model) for item in stated if item.name in expected],
-        expected,
-        good=good,
-        bits=acquisition.instrument.bits,
-        dark_at=model.base.maps.dark_at,
-        side=side,
-        tell=tell,
-    )
-    return seen, [*skipped, *left_out]
 
 
 def _as_light(item: SessionSeries, model: ForwardModel) -> SessionSeries:
@@ -286,85 +226,43 @@ def _as_light(item: SessionSeries, model: ForwardModel) -> SessionSeries:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Part:
-    """What one series brings into the problem."""
-
-    view: SeriesView
-    block: SeriesBlock
-    probed: ProbedSeries
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class _Compared:
-    """A session and the changes that every series of it is asked with.
+    """A session and the changes that every series of it is asked with."""
 
-    Fields: measured; asked: changes, those of variants' strengths first, then steps, the twin less each of its effects last; had:
-    these effects; variants; steps: of nuisances that lie in the twin; scenes: see `other_scenes`; back: prior standard
-    deviations from the base twin's spectral parameters to the calibrated ones, by name; side: of the squares of the panel's
-    pixels that stand for pixels.
-    """
-
-    measured: _Measured
+    measured: MeasuredSession
+    # changes, those of variants' strengths first, then steps, the twin less each of its effects last
     asked: tuple[Asked, ...]
-    had: Mapping[str, AppliedEffect]
+    had: Mapping[str, AppliedEffect]  # these effects
     variants: tuple[Variant, ...]
-    steps: tuple[Change, ...]
+    steps: tuple[Change, ...]  # of nuisances that lie in the twin
     scenes: Mapping[str, OtherScenes]
-    back: Mapping[str, float]
-    side: int
+    back: Mapping[str, float]  # prior sds from the base twin's spectral parameters to the calibrated ones, by name
+    side: int  # of the squares of the panel's pixels that stand for pixels
 
-    def part(self, one: SeriesModel) -> _Part:
+    def block(self, one: SeriesModel) -> SeriesBlock:
         """One series: its templates and projections, and what every change does to it."""
         measured, session = self.measured, self.measured.expected
-        moved = session.moved(one, self.asked)
-        frame = mean_frame(
-            one, measured.pictures[one.name], session.maps, frames=measured.summaries[one.name].frames, side=self.side
-        )
-        probes = series_probes(
-            session,
-            one,
-            frame,
-            summary=measured.summaries[one.name],
-            moved=moved,
-            variants=self.variants,
-            all_outliers=measured.outliers,
-            memory=measured.memory.get(one.name),
-            copies=measured.copies.get(one.name, 0),
-            lasting=measured.lasting,
-        )
+        summary, moved = measured.summaries[one.name], session.moved(one, self.asked)
+        frame = mean_frame(one, measured.pictures[one.name], session.maps, frames=summary.frames, side=self.side)
+        probes = series_probes(measured, one, frame, moved=moved, variants=self.variants)
         scenes = self.scenes.get(one.name, NO_SCENES)
         nuisances = nuisances_of_series(session, probes, frame.signal_DN, scenes.drawn(session, one, session.unchanged))
-        return _Part(
-            view=_view(one, frame, measured.summaries[one.name]),
-            block=series_block(probes, frame, self.asked, moved, nuisances),
-            probed=ProbedSeries(probes=probes, signal_DN=frame.signal_DN, scenes=scenes),
+        return series_block(
+            probes, frame, summary=summary, scenes=scenes, asked=self.asked, moved=moved, nuisances=nuisances
         )
 
 
-def _view(one: SeriesModel, frame: MeanFrame, summary: SeriesSummary) -> SeriesView:
-    return SeriesView(
-        session=one.session,
-        summary=summary,
-        expected=one.expected,
-        signal_DN=np.asarray(frame.signal_DN, np.float32),
-        residual_DN=np.asarray(frame.residual_DN, np.float32),
-        noise_DN=np.sqrt(frame.quantum_DN2 + frame.white_DN2).astype(np.float32),
-        mask=frame.mask,
-    )
-
-
-def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
+def _joined(blocks: Sequence[SeriesBlock], compared: _Compared) -> Problem:
     """The problem that all series together make."""
-    blocks = [part.block for part in parts]
     session = compared.measured.expected
     responses = np.concatenate([block.responses for block in blocks], axis=1)
-    names = tuple(name for block in blocks for name in block.names)
+    names = tuple(name for block in blocks for name in block.probes.names)
     series_of = np.repeat(np.arange(len(blocks)), [len(block) for block in blocks])
     factors = _factors(blocks, responses, compared)
     first_less = len(responses) - len(compared.had)
     done = {effect: -response for effect, response in zip(compared.had, responses[first_less:], strict=True)}
-    curves, missing = _curves(parts, responses, names, compared, done)
-    of_probes = [(name.axis, blocks[number].session.series) for number, name in zip(series_of, names, strict=True)]
+    curves, missing = _curves(blocks, responses, names, compared, done)
+    of_probes = [(name.axis, block.session.series) for block in blocks for name in block.probes.names]
     groups, _ = _numbered(
         [
             f"{axis}, {series.kind} {series.scene} {series.kV if series.kind != 'dark' else ''}".strip()
@@ -384,29 +282,29 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
         curves=tuple(curves),
         names=names,
         series_of=series_of,
-        sd=np.concatenate([block.sd for block in blocks]),
-        noise=np.concatenate([block.noise for block in blocks]),
+        sd=np.concatenate([block.probes.sd for block in blocks]),
+        noise=np.concatenate([block.probes.noise for block in blocks]),
         groups=groups,
         families=_families(names, [series for _, series in of_probes]),
         blocks=sharing[series_of],
-        views=tuple(part.view for part in parts),
+        views=tuple(block.view for block in blocks),
         session=session,
         skipped=compared.measured.skipped,
         missing_effects=missing,
         again=AskedAgain(
             session=session,
-            series=tuple(part.probed for part in parts),
+            series=tuple(blocks),
             # a spectrum's parameters cancel in calibrating flats to a ten thousandth, as straight lines about the base alone
             steps=tuple(step for step in compared.steps if step.steps != "lit"),
             done=done,
             factors=factors,
         ),
         side=compared.side,
-        given=tuple(_as_given(item, done[effect], session, parts) for effect, item in compared.had.items()),
+        given=tuple(_as_given(item, done[effect], session, blocks) for effect, item in compared.had.items()),
     )
 
 
-def _as_given(effect: AppliedEffect, done: NDArray[np.float64], session: SessionModel, parts: Sequence[_Part]) -> Point:
+def _as_given(effect: AppliedEffect, done: FloatArray, session: SessionModel, blocks: Sequence[SeriesBlock]) -> Point:
     """An effect that the twin has, as it has it; done (probe,): what it does there."""
     inner = {name: value for name, value in effect.parameters.items() if name != "strength"}
     strength = abs(effect.parameters["strength"])
@@ -419,7 +317,7 @@ def _as_given(effect: AppliedEffect, done: NDArray[np.float64], session: Session
         high=strength,
         strengths=(strength,),
     )
-    inflow = border_inflow(session, [part.probed.probes for part in parts], effect)
+    inflow = border_inflow(session, [block.probes for block in blocks], effect)
     curve = Curve(variant=variant, responses=done[None, :], spread=inflow)
     level = USUAL_LEVEL if effect.law_sd is None else min(effect.law_sd, FARTHEST_LEVEL)
     # found without an interval, or stated by hand: as intervals of strengths are widened for real laws
@@ -451,13 +349,13 @@ def _families(names: Sequence[ProbeName], series: Sequence[Series]) -> Families:
     )
 
 
-def _numbered(keys: Sequence[_Key]) -> tuple[NDArray[np.intp], tuple[_Key, ...]]:
+def _numbered(keys: Sequence[_Key]) -> tuple[IndexArray, tuple[_Key, ...]]:
     """Number of each key (key,), in the order in which they first occur, and the keys by number."""
     numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     return np.array([numbers[key] for key in keys], dtype=np.intp), tuple(numbers)
 
 
-def _factors(blocks: Sequence[SeriesBlock], responses: NDArray[np.float64], compared: _Compared) -> Columns:
+def _factors(blocks: Sequence[SeriesBlock], responses: FloatArray, compared: _Compared) -> Columns:
     """Responses (probe,) to nuisances by name: what calibration fitted, and what series have of their own."""
     columns: Columns = {}
     first = sum(len(variant.strengths) for variant in compared.variants)
@@ -471,20 +369,15 @@ def _factors(blocks: Sequence[SeriesBlock], responses: NDArray[np.float64], comp
     return notable(columns)
 
 
-def _of_quanta() -> dict[str, str]:
-    """Why effects on the statistics of quanta cannot be judged from the noise that calibrates, by id."""
-    return {effect.id: _OWN_NOISE for effect in EFFECTS.values() if effect.stage == "quanta"}
-
-
 def _curves(
-    parts: Sequence[_Part],
-    responses: NDArray[np.float64],
+    blocks: Sequence[SeriesBlock],
+    responses: FloatArray,
     names: Sequence[ProbeName],
     compared: _Compared,
-    done: Mapping[str, NDArray[np.float64]],
+    done: Mapping[str, FloatArray],
 ) -> tuple[list[Curve], dict[str, str]]:
     """Curves, and why each effect without one cannot be judged; done (probe,): by the base's own effects."""
-    blocks, probes = [part.block for part in parts], [part.probed.probes for part in parts]
+    probes = [block.probes for block in blocks]
     session = compared.measured.expected
     curves: list[Curve] = []
     missing: dict[str, str] = {}

@@ -3,25 +3,20 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import BoolArray
 from ..model.changes import LINE_NOISE_LIMIT
 from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
 from ..session.usable import SeenSeries
 
 
 def usual_line_noise(
-    seen: Sequence[SeenSeries], summaries: Mapping[str, SeriesSummary], clean: NDArray[np.bool_]
+    seen: Sequence[SeenSeries], summaries: Mapping[str, SeriesSummary], clean: BoolArray
 ) -> tuple[float, float]:
     """Variance (DN^2) of the rows' and of the columns' offsets in one exposure, from darks, at most what no effect is.
 
-    Of a mean over C pixels of a row, var = r^2 + (v - r^2) / C, v the variance of a pixel; columns alike. What the twin knows
-    of it already is not counted again.
-
-    Args:
-        seen: series that can be compared; the darks that calibrate tell, all darks where none does.
-        summaries: what the frames' noise says, by name.
-        clean: pixels in use that do not stand out (row, column).
+    Of a mean over C pixels of a row, var = r^2 + (v - r^2) / C, v the variance of a pixel; columns alike. The darks that calibrate
+    tell, all darks where none does. What the twin knows of it already is not counted again.
     """
     darks = [one for one in seen if one.session.series.kind == "dark" and summaries[one.name].frames > 2]
     darks = [one for one in darks if one.session.calibrates] or darks

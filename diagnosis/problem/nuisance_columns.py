@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ...calibration.flats.setting_errors import EXPOSURE_SD_MS
 from ...generator.frames.declared_spot import declared_spot_px
 from ...generator.line.line_state import FixedPattern, TilePattern
+from ..arrays import FloatArray, RealArray
 from ..model import changes as scales
 from ..model.point_maps import blurred_between_points, sampled_at_points
 from ..model.responses import Moved, SessionModel
@@ -25,22 +26,13 @@ from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
 from .other_scenes import Redrawn
 from .series_probes import SeriesProbes
 
-Columns = dict[str, NDArray[np.float64]]
-_Images = dict[str, NDArray[np.floating]]
+Columns = dict[str, FloatArray]
+_Images = dict[str, RealArray]
 _UNKNOWN_GAIN_SD = 0.5  # relative, of the gain of a beam of unknown voltage
 
 
-def nuisances_of_series(
-    session: SessionModel, probes: SeriesProbes, signal: NDArray[np.float64], redrawn: Redrawn
-) -> Columns:
-    """Nuisances of one series by name, shrunk.
-
-    Args:
-        session: all series.
-        probes: of the series.
-        signal: expected (row, column), DN.
-        redrawn: what other scenes would show.
-    """
+def nuisances_of_series(session: SessionModel, probes: SeriesProbes, signal: FloatArray, redrawn: Redrawn) -> Columns:
+    """Nuisances of one series by name, shrunk; signal: expected (row, column), DN; redrawn: what other scenes would show."""
     item, model, beams_differ = probes.series.session, session.model, session.model.beams_differ
     columns: Columns = {
         "shape of the noise": probes.of_scalars(lambda probe: scales.KURTOSIS_SD if probe.name == "kurtosis" else 0.0)
@@ -53,7 +45,11 @@ def nuisances_of_series(
     if item.series.kind != "flat":  # against a flat's light it is nothing
         images[f"dark of {item.name}"] = np.full(signal.shape, scales.DARK_SD_DN)
     if not item.calibrates:
-        columns["few new bad pixels"] = _few_bad_pixels(probes)
+        # half of the few pixels that may turn bad without that being an effect, as counts of outliers show them
+        few = 0.5 * max(scales.FEW_BAD_PIXELS, scales.FEW_BAD_SHARE * probes.series.context.areas.order.size)
+        more = root_of_count(few) - root_of_count(0)
+        counts = (OUTLIERS, OUTLIERS_ANYWHERE)
+        columns["few new bad pixels"] = probes.of_scalars(lambda probe: more if probe.name in counts else 0.0)
     if item.series.kind == "object":
         columns |= _of_thickness(probes, signal, redrawn.thicker, beams_differ)
         images |= _of_scene(item, signal, sharp=model.sharp, rough=probes.rendered / RENDER_SHARE)
@@ -110,11 +106,11 @@ def _of_beam(probes: SeriesProbes, beams_differ: float) -> Columns:
     return columns
 
 
-def _texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.float64]:
+def _texture(probes: SeriesProbes, lag: tuple[int, int]) -> FloatArray:
     return probes.of_scalars(lambda probe: scales.TEXTURE_SD if probe.lag == lag else 0.0)
 
 
-def _read_texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.float64]:
+def _read_texture(probes: SeriesProbes, lag: tuple[int, int]) -> FloatArray:
     """READ_TEXTURE_SD of correlation in the read noise at a lag: of neighbours, and of means over lines and blocks.
 
     The variance of a mean of n pixels in line is 1 + 2 sum_d (1 - d / n) rho_d times that of independent ones.
@@ -147,7 +143,7 @@ def _white_shares(probes: SeriesProbes) -> tuple[float, dict[str, float]]:
     return white / max(of_quanta + white, LEAST_NOISE_DN2), dict(zip(context.label_names, shares, strict=True))
 
 
-def brighter(probes: SeriesProbes, signal: NDArray[np.float64]) -> NDArray[np.float64]:
+def brighter(probes: SeriesProbes, signal: FloatArray) -> FloatArray:
     """What 1 % more light does to a series (probe,), not shrunk: to its mean frame, and to the noise of its quanta.
 
     signal: expected (row, column), DN.
@@ -161,7 +157,7 @@ def brighter(probes: SeriesProbes, signal: NDArray[np.float64]) -> NDArray[np.fl
     return np.asarray(level + probes.of_scalars(noisier))
 
 
-def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: float) -> _Images:
+def _of_field(item: SessionSeries, signal: FloatArray, beams_differ: float) -> _Images:
     """Level of beam and series, and gradient of the field."""
     images: _Images = {
         f"level of {_beam(item)}": beams_differ * scales.LEVEL_OF_BEAM_SD * signal,
@@ -184,15 +180,15 @@ def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: fl
 
 
 @lru_cache(maxsize=2)
-def _shapes(size: tuple[int, ...]) -> tuple[NDArray[np.float64], ...]:
+def _shapes(size: tuple[int, ...]) -> tuple[FloatArray, ...]:
     """Smooth changes (row, column) of the open field, relative: SHAPE_SD rms in all."""
     found = _smooth(size, scales.SHAPE_ORDER)
     total = math.sqrt(sum(1.0 / order**2 for order, _ in found))
     return tuple(scales.SHAPE_SD / order / total / float(np.sqrt(np.mean(shape**2))) * shape for order, shape in found)
 
 
-def _smooth(size: tuple[int, ...], highest: int) -> list[tuple[int, NDArray[np.float64]]]:
-    """Products (row, column) of Legendre polynomials, each after its order, 1 to the highest; standard deviations fall as one over it."""
+def _smooth(size: tuple[int, ...], highest: int) -> list[tuple[int, FloatArray]]:
+    """Products (row, column) of Legendre polynomials, each after its order, 1 to the highest: the higher, the less likely."""
     from numpy.polynomial.legendre import legvander
 
     down, across = (legvander(np.linspace(-1.0, 1.0, length), highest) for length in size)
@@ -207,19 +203,8 @@ def _of_steps(probes: SeriesProbes, name: str) -> float:
     return math.log1p(jitter / own)
 
 
-def _few_bad_pixels(probes: SeriesProbes) -> NDArray[np.float64]:
-    """Half of the few pixels that may turn bad without that being an effect, as counts of outliers show them."""
-    few = 0.5 * max(scales.FEW_BAD_PIXELS, scales.FEW_BAD_SHARE * probes.series.context.areas.order.size)
-    more = root_of_count(few) - root_of_count(0)
-    return probes.of_scalars(lambda probe: more if probe.name in (OUTLIERS, OUTLIERS_ANYWHERE) else 0.0)
-
-
-def _of_scene(item: SessionSeries, signal: NDArray[np.float64], *, sharp: bool, rough: float) -> _Images:
-    """Where a scene lies and how its outline is drawn.
-
-    signal: expected (row, column), DN; sharp: pixels see no farther than themselves; rough: how far outlines
-    depart from their maps along them, over what is assumed.
-    """
+def _of_scene(item: SessionSeries, signal: FloatArray, *, sharp: bool, rough: float) -> _Images:
+    """Where a scene lies and how its outline is drawn; rough: how far outlines depart from their maps, over what is assumed."""
     place = _place(item)
     dy, dx = gradient(signal)
     rows, columns = signal.shape
@@ -241,11 +226,8 @@ def _of_scene(item: SessionSeries, signal: NDArray[np.float64], *, sharp: bool, 
     return images
 
 
-def _of_spot(sigma_px: float, signal: NDArray[np.float64]) -> _Images:
-    """What another size of the focal spot than the instrument states does: blur that grows with the magnification.
-
-    sigma_px: of its image behind this scene; signal: expected (row, column), DN.
-    """
+def _of_spot(sigma_px: float, signal: FloatArray) -> _Images:
+    """What another size of the focal spot, sigma_px of its image here, does: blur that grows with the magnification."""
     if sigma_px == 0.0:
         return {}
     more_px2 = 2.0 * scales.SPOT_SD * sigma_px**2
@@ -255,7 +237,7 @@ def _of_spot(sigma_px: float, signal: NDArray[np.float64]) -> _Images:
     }
 
 
-def _blurred_more(signal: NDArray[np.float64], variance_px2: float, *, axis: int) -> NDArray[np.float64]:
+def _blurred_more(signal: FloatArray, variance_px2: float, *, axis: int) -> FloatArray:
     """What a Gaussian blur of this variance along an axis adds to a picture (row, column), which mirrors at its borders."""
     from scipy.fft import dct, idct
 
@@ -264,7 +246,7 @@ def _blurred_more(signal: NDArray[np.float64], variance_px2: float, *, axis: int
     return np.asarray(idct(dct(signal, axis=axis) * (loss if axis == 1 else loss[:, None]), axis=axis))
 
 
-def _between_points(item: SessionSeries, signal: NDArray[np.float64]) -> _Images:
+def _between_points(item: SessionSeries, signal: FloatArray) -> _Images:
     """Where pixels jump as maps of points do, what a blur shows of how borders run between them."""
     maps = item.request.thickness_mm
     if maps is None or not sampled_at_points(maps):
@@ -293,7 +275,7 @@ def _rough_fields(shape: tuple[int, ...], place: str) -> NDArray[np.float32]:
 
 
 def _of_thickness(
-    probes: SeriesProbes, signal: NDArray[np.float64], thicker: Mapping[str, Moved], beams_differ: float
+    probes: SeriesProbes, signal: FloatArray, thicker: Mapping[str, Moved], beams_differ: float
 ) -> Columns:
     """Thickness and attenuation of the scene's materials; where beams differ, how attenuation changes with the depth as well."""
     item, expected = probes.series.session, probes.series.scalars
@@ -316,12 +298,8 @@ def _of_thickness(
     return columns
 
 
-def _gain_map_noise(session: SessionModel, probes: SeriesProbes, signal: NDArray[np.float64]) -> Columns:
-    """Smooth noise of the gain map by shape: what few calibrating frames leave of it is the same in every series.
-
-    Empty where the series has no part in it: before the beam, for those that calibrate, and where the gain map was applied before.
-    signal: expected (row, column), DN.
-    """
+def _gain_map_noise(session: SessionModel, probes: SeriesProbes, signal: FloatArray) -> Columns:
+    """Smooth noise of the gain map by shape, as few calibrating frames leave it in every series that it divides."""
     item, maps = probes.series.session, session.maps
     if not item.request.beam_on or item.calibrates or "gain" in item.series.corrected:
         return {}
@@ -336,7 +314,7 @@ def _gain_map_noise(session: SessionModel, probes: SeriesProbes, signal: NDArray
     return {f"gain map {i},{j}": column for (i, j), column in zip(waves, found, strict=True)}
 
 
-def offset_of_later(probes: SeriesProbes) -> NDArray[np.float64]:
+def offset_of_later(probes: SeriesProbes) -> FloatArray:
     """What one DN more in every pixel of a later series does (probe,)."""
     if probes.series.session.calibrates:
         return np.zeros(len(probes))
@@ -349,8 +327,8 @@ def offset_of_later(probes: SeriesProbes) -> NDArray[np.float64]:
 
 
 def changed_gain_pattern(
-    probes: SeriesProbes, signal: NDArray[np.float64], patterns: Iterable[FixedPattern]
-) -> tuple[NDArray[np.float64], dict[FixedPattern, NDArray[np.float64]]]:
+    probes: SeriesProbes, signal: FloatArray, patterns: Iterable[FixedPattern]
+) -> tuple[FloatArray, dict[FixedPattern, FloatArray]]:
     """What 1 % of a changed gain map does by chance: responses (probe, wave) of its smooth part, variance (probe,) of the rest.
 
     signal: expected (row, column), DN; patterns: what the rest may be, by which it is given.
@@ -371,7 +349,7 @@ def changed_gain_pattern(
     return smooth, rest
 
 
-def changed_tiles(probes: SeriesProbes, signal: NDArray[np.float64], tiles: TilePattern) -> NDArray[np.float64]:
+def changed_tiles(probes: SeriesProbes, signal: FloatArray, tiles: TilePattern) -> FloatArray:
     """What gains of tiles of 1 % rms do by chance: responses (probe, tile); signal: (row, column), DN."""
     item, maps = probes.series.session, len(probes.projection)
     rows, columns = tiles.rows.tile_of(signal.shape[0]), tiles.columns.tile_of(signal.shape[1])
@@ -383,7 +361,7 @@ def changed_tiles(probes: SeriesProbes, signal: NDArray[np.float64], tiles: Tile
     return found
 
 
-def noise_of_lines(probes: SeriesProbes) -> NDArray[np.float64]:
+def noise_of_lines(probes: SeriesProbes) -> FloatArray:
     """Variance (2, probe) that noise of 1 DN, new in every exposure and common to rows (to columns), leaves in a mean frame."""
     request = probes.series.session.request
     variance = probes.projection.line_noise() / (request.frames * request.exposures_per_frame)
@@ -404,13 +382,13 @@ def _pattern_waves(shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 
 @lru_cache(maxsize=8)
-def _waves(shape: tuple[int, ...], count: int) -> dict[tuple[int, int], NDArray[np.float64]]:
+def _waves(shape: tuple[int, ...], count: int) -> dict[tuple[int, int], FloatArray]:
     """Products of `count` cosines along each side (row, column), by their numbers; the even field is left out."""
     y, x = (np.cos(np.pi * np.outer(np.arange(count), (np.arange(length) + 0.5) / length)) for length in shape)
     return {(i, k): np.outer(y[i], x[k]) for i in range(count) for k in range(count) if i or k}
 
 
-def uneven(probes: SeriesProbes, images: Mapping[int, Map], shape: tuple[int, ...]) -> dict[int, NDArray[np.float64]]:
+def uneven(probes: SeriesProbes, images: Mapping[int, Map], shape: tuple[int, ...]) -> dict[int, FloatArray]:
     """Responses (smooth shape, probe), not shrunk, to more of a change in one part of the panel than in another, by key.
 
     A panel seldom warms evenly, and no anode's heel is a straight line. images: what changes do to the mean frame (row, column

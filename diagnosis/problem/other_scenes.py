@@ -4,26 +4,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import RealArray
 from ..model import changes as scales
 from ..model.point_maps import sampled_at_points
 from ..model.responses import Asked, Moved, SeriesModel, SessionModel
 from ..probes.straight_edge import covered_scene
 from ..session.even_maps import Map
 
-_Maps = Mapping[str, NDArray[np.floating]]
+_Maps = Mapping[str, RealArray]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OtherScenes:
-    """Thickness maps (row, column), mm, of what may stand in a scene's place.
+    """Thickness maps (row, column), mm, of what may stand in a scene's place."""
 
-    Fields: thicker: with one material thicker by THICKNESS_SD, by that material; covered: with a straight or round border drawn by
-    the share of each pixel that it covers; None: the maps show none, or have it so.
-    """
-
-    thicker: Mapping[str, _Maps]
+    thicker: Mapping[str, _Maps]  # one material thicker by THICKNESS_SD, by that material
+    # a straight or round border drawn by the share of each pixel that it covers; None: there is none, or drawn so
     covered: _Maps | None
 
     def drawn(self, session: SessionModel, one: SeriesModel, asked: Asked) -> "Redrawn":

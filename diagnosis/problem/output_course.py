@@ -5,25 +5,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.line.series_request import SeriesRequest
+from ..arrays import FloatArray
 
 _MOMENTS = 8  # of a series, that stand for its exposures against another's
 
 
 @dataclass(frozen=True, slots=True)
 class OutputCourse:
-    """How a wandering output of unit variance moves: a share new in every exposure, the rest with exp(-|dt| / tau).
+    """How a wandering output of unit variance moves: a share new in every exposure, the rest with exp(-|dt| / tau)."""
 
-    Fields: correlation_s, tau, s; jitter_share, 0 to 1; idle_s: pause before each series whose pause is not stated, s.
-    """
+    correlation_s: float  # tau
+    jitter_share: float  # 0 to 1
+    idle_s: float = 0.0  # pause before each series whose pause is not stated
 
-    correlation_s: float
-    jitter_share: float
-    idle_s: float = 0.0
-
-    def means(self, requests: Sequence[SeriesRequest], readout_ms: float | None) -> NDArray[np.float64]:
+    def means(self, requests: Sequence[SeriesRequest], readout_ms: float | None) -> FloatArray:
         """A root (series, factor) of the covariance of the series' means."""
         middles = (np.arange(_MOMENTS) + 0.5) / _MOMENTS
         idle_s = self.idle_s * np.cumsum([not item.pause_stated for item in requests])
@@ -46,11 +43,11 @@ class OutputCourse:
         step_s = request.interval_s(readout_ms) * request.exposures_per_frame
         return math.sqrt(1.0 - (1.0 - self.jitter_share) * math.exp(-step_s / self.correlation_s))
 
-    def along(self, profile: NDArray[np.float64], request: SeriesRequest, readout_ms: float | None) -> float:
+    def along(self, profile: FloatArray, request: SeriesRequest, readout_ms: float | None) -> float:
         """Standard deviation of the projection of a series' frames on a profile (frame,)."""
         return math.sqrt(max(float(profile @ self._frames(request, readout_ms) @ profile), 0.0))
 
-    def _frames(self, request: SeriesRequest, readout_ms: float | None) -> NDArray[np.float64]:
+    def _frames(self, request: SeriesRequest, readout_ms: float | None) -> FloatArray:
         """Covariance (frame, frame) of a series' stored frames."""
         step_s = request.interval_s(readout_ms) * request.exposures_per_frame
         number = np.arange(request.frames)
@@ -59,13 +56,10 @@ class OutputCourse:
         return np.asarray((1.0 - self.jitter_share) * np.exp(-lag_s / self.correlation_s) + jitter)
 
 
-def rms_about_mean(levels: Sequence[float], courses: Sequence[NDArray[np.float64]], noise: Sequence[float]) -> float:
+def rms_about_mean(levels: Sequence[float], courses: Sequence[FloatArray], noise: Sequence[float]) -> float:
     """Root mean square of all frames' relative output about its mean over them, noise taken off; 0 where noise is all.
 
-    Args:
-        levels: of each series over what is expected, less 1.
-        courses: of each series, frame by frame (frame,), relative, about any level.
-        noise: variance of one frame's level in each series that is no output.
+    Of each series: level over what is expected, less 1; course (frame,), relative; variance of a frame's level that is no output.
     """
     frames = np.array([len(course) for course in courses], dtype=np.float64)
     middle = float(frames @ np.asarray(levels)) / float(frames.sum())

@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...checks.readings import Explained
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.effects.effect import OF_FRAMES
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.twin import Twin
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..inference.observed import Point
 from ..inference.seen import Blocks
 from ..inference.unknown import Families
@@ -19,60 +19,37 @@ from ..model.curves import Curve
 from ..model.forward_model import draft_cache
 from ..model.responses import SessionModel
 from ..probes.probes import ProbeName
-from ..session.even_maps import Map, full_size
-from ..session.session import SessionSeries
-from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
+from ..session.even_maps import full_size
+from ..session.summaries import LEAST_NOISE_DN2
 from .asked_again import AskedAgain
 from .scenes_apart import scenes_apart
+from .series_block import SeriesView
 
 _WITHOUT_SCENE = 0.07  # time that a series without a scene takes, over that of one with a scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SeriesView:
-    """One series with what pictures of the gap need: measured and expected signal (row, column), and the mean's noise."""
-
-    session: SessionSeries
-    summary: SeriesSummary
-    expected: ExpectedSeries
-    signal_DN: Map
-    residual_DN: Map
-    noise_DN: Map
-    mask: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
-    """Everything that inference needs; probes are standardised.
+    """Everything that inference needs; probes are standardised."""
 
-    Fields: residual (probe,); factors (probe, nuisance) and factor_names; curves; names (one ProbeName a probe);
-    series_of (probe,) index into views; sd (probe,) of scalar probes in their unit, 1 for map probes; noise (probe,): counting
-    noise's share of each probe's standard deviation; blocks (probe,):
-    series that share local nuisances; groups (probe,): within which an effect's law is off by one factor; families: in which an
-    unknown effect may show; views; session: the forward model of its series; skipped: what could not be used and why;
-    missing_effects: effects that cannot be judged here and why; again asks the forward model once more; side of the squares of the
-    panel's pixels that stand for pixels; given: the effects of the base, which are taken off the residual: what they do, at their
-    strengths.
-    """
-
-    residual: NDArray[np.float64]
-    factors: NDArray[np.float64]
+    residual: FloatArray  # (probe,)
+    factors: FloatArray  # (probe, nuisance)
     factor_names: tuple[str, ...]
     curves: tuple[Curve, ...]
-    names: tuple[ProbeName, ...]
-    series_of: NDArray[np.intp]
-    sd: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    groups: NDArray[np.intp]
-    families: Families
-    blocks: NDArray[np.intp]
+    names: tuple[ProbeName, ...]  # one a probe
+    series_of: IndexArray  # (probe,): index into views
+    sd: FloatArray  # (probe,): of scalar probes in their unit, 1 for map probes
+    noise: FloatArray  # (probe,): counting noise's share of each probe's standard deviation
+    groups: IndexArray  # (probe,): within which an effect's law is off by one factor
+    families: Families  # in which an unknown effect may show
+    blocks: IndexArray  # (probe,): series that share local nuisances
     views: tuple[SeriesView, ...]
-    session: SessionModel
-    skipped: tuple[str, ...]
-    missing_effects: dict[str, str]
-    again: AskedAgain | None
-    side: int = 1
-    given: tuple[Point, ...] = ()
+    session: SessionModel  # the forward model of its series
+    skipped: tuple[str, ...]  # what could not be used and why
+    missing_effects: dict[str, str]  # that cannot be judged here, and why
+    again: AskedAgain | None  # asks the forward model once more; None: released
+    side: int = 1  # of the squares of the panel's pixels that stand for pixels
+    given: tuple[Point, ...] = ()  # the effects of the base, taken off the residual, at their strengths
 
     @property
     def base(self) -> Twin:
@@ -106,7 +83,7 @@ class Problem:
         )
         return self if own is None else replace(self, curves=(*self.curves, own))
 
-    def residual_without(self, effects: Sequence[str]) -> NDArray[np.float64]:
+    def residual_without(self, effects: Sequence[str]) -> FloatArray:
         """The residual (probe,) of the base less those of its own effects that are among these."""
         left = self.residual.copy()
         for point in self.given:
@@ -114,7 +91,7 @@ class Problem:
                 left += point.curve.response(point.strength)
         return left
 
-    def left_by(self, points: Sequence[Point], *, without: Sequence[str] = ()) -> NDArray[np.float64]:
+    def left_by(self, points: Sequence[Point], *, without: Sequence[str] = ()) -> FloatArray:
         """What effects at their strengths leave of the residual (probe,).
 
         They take the place of the base's own; of these, those in `without` are not there either.
@@ -124,7 +101,7 @@ class Problem:
             left -= point.curve.response(point.strength)
         return left
 
-    def with_chance(self, points: Sequence[Point]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def with_chance(self, points: Sequence[Point]) -> tuple[FloatArray, FloatArray]:
         """Factors (probe, factor) of nuisances and of what effects do by chance; variance (probe,) of each probe by itself."""
         factors = np.concatenate([self.factors, *(point.strength * point.curve.chance for point in points)], axis=1)
         variance = np.ones(len(self.residual))
@@ -134,22 +111,22 @@ class Problem:
         return factors, variance
 
     @property
-    def places(self) -> NDArray[np.intp]:
+    def places(self) -> IndexArray:
         """Place of each probe (probe,): one axis of one series, or what one effect alone can make there."""
         return self._numbered([name.axis for name in self.names])
 
     @property
-    def left_apart(self) -> NDArray[np.intp]:
+    def left_apart(self) -> IndexArray:
         """Series of each probe (probe,), what one effect alone can make apart: a law leaves nothing where it moves nothing."""
         return self._numbered(["" for _ in self.names])
 
     @property
-    def aspects(self) -> NDArray[np.intp]:
+    def aspects(self) -> IndexArray:
         """The same (probe,), with what a series' mean frame shows and each kind of what its frames differ by apart."""
         return self._numbered([name.axis if name.axis in OF_FRAMES else "mean frame" for name in self.names])
 
     @property
-    def alike(self) -> NDArray[np.intp]:
+    def alike(self) -> IndexArray:
         """Number (probe,) of the beam, scene and geometry, calibrating or not, of a probe of the mean frame; -1 for others."""
         keys = []
         for view, name in zip(self.series_of, self.names, strict=True):
@@ -161,7 +138,7 @@ class Problem:
         _, found = np.unique(keys, return_inverse=True)
         return np.where(np.array(keys) == "", -1, found).astype(np.intp)
 
-    def _numbered(self, kinds: Sequence[str]) -> NDArray[np.intp]:
+    def _numbered(self, kinds: Sequence[str]) -> IndexArray:
         exact = read_exactly()
         own = [
             name.statistic if name.statistic in exact else kind for name, kind in zip(self.names, kinds, strict=True)
@@ -196,9 +173,7 @@ class Problem:
         model = replace(self.session.model, cache=draft_cache())
         return replace(self, again=None, session=replace(self.session, model=model))
 
-    def respond(
-        self, variants: Sequence[Variant], /, wanted: NDArray[np.bool_] | None = None
-    ) -> Mapping[int, NDArray[np.float64]]:
+    def respond(self, variants: Sequence[Variant], /, wanted: BoolArray | None = None) -> Mapping[int, FloatArray]:
         """Responses (strength, probe) of further variants, see `AskedAgain.respond`."""
         return self._open.respond(variants, wanted)
 
@@ -213,7 +188,7 @@ class Problem:
             raise RuntimeError("asked of a problem whose projections were released")
         return self.again
 
-    def with_variants(self, more: Sequence[tuple[Variant, NDArray[np.float64]]]) -> "Problem":
+    def with_variants(self, more: Sequence[tuple[Variant, FloatArray]]) -> "Problem":
         """With further variants and their responses (strength, probe)."""
         curves = []
         for variant, responses in more:
@@ -229,13 +204,11 @@ class Problem:
 
 def _difference(before: ExpectedSeries, after: ExpectedSeries, *, shape: tuple[int, ...]) -> Explained:
     """What has been added to a series' mean, and by what its frames' variance was multiplied (row, column)."""
-    variances = [
+    first, last = (
         np.maximum(item.quantum_variance_DN2 + item.white_variance_DN2, LEAST_NOISE_DN2) for item in (before, after)
-    ]
-    return Explained(
-        mean_DN=full_size(after.mean_DN - before.mean_DN, shape),
-        variance=full_size(variances[1] / variances[0], shape),
     )
+    mean_DN = full_size(after.mean_DN - before.mean_DN, shape)
+    return Explained(mean_DN=mean_DN, variance=full_size(last / first, shape))
 
 
 def read_exactly() -> frozenset[str]:

@@ -5,17 +5,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
+from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.line_state import FixedPattern, TilePattern, between_lines
+from ..arrays import BoolArray, FloatArray, RealArray
 from ..model import changes as scales
 from ..model.changes import Variant
 from ..model.curves import places_of
 from ..model.responses import Asked, Moved
-from ..probes.probes import ProbeName
 from ..probes.scalar_context import time_templates
+from ..session.even_maps import Map
 from ..session.session import SessionSeries
+from ..session.summaries import SeriesSummary
 from .nuisance_columns import (
     Columns,
     brighter,
@@ -25,86 +27,94 @@ from .nuisance_columns import (
     offset_of_later,
     uneven,
 )
+from .other_scenes import OtherScenes
 from .output_course import OutputCourse
 from .series_probes import MeanFrame, SeriesProbes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SeriesBlock:
-    """The part of a problem that one series makes; its probes are standardised.
-
-    Fields: session; names (one a probe); residual, sd, noise (probe,), as in `Problem`; nuisances (probe,) by name; responses
-    (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN more in every pixel; brighter (probe,): of 1 %
-    more light; pattern (probe, wave), pattern_jitter (probe,) by what the rest of it is: what 1 % of a changed gain map does by
-    chance; lines (2, probe): variance of what 1 DN of noise common to rows (to columns) does; lit_lines, alike, of 1 % of the
-    light; uneven (shape, probe) by number of change: more of it in one part of the panel; tiles (probe, tile), alike: what 1 % of
-    changed gains of its tiles does by chance.
-    """
+class SeriesView:
+    """One series with what pictures of the gap need: measured and expected signal (row, column), and the mean's noise."""
 
     session: SessionSeries
-    names: list[ProbeName]
-    residual: NDArray[np.float64]
-    sd: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    nuisances: Columns
-    responses: NDArray[np.float64]
-    offset: NDArray[np.float64]
-    brighter: NDArray[np.float64]
-    pattern: NDArray[np.float64]
-    pattern_jitter: dict[FixedPattern, NDArray[np.float64]]
-    lines: NDArray[np.float64]
-    lit_lines: NDArray[np.float64]
-    uneven: dict[int, NDArray[np.float64]]
-    tiles: dict[int, NDArray[np.float64]]
+    summary: SeriesSummary
+    expected: ExpectedSeries
+    signal_DN: Map
+    residual_DN: Map
+    noise_DN: Map
+    mask: BoolArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesBlock:
+    """The part of a problem that one series makes; its probes are standardised."""
+
+    view: SeriesView
+    probes: SeriesProbes
+    signal_DN: RealArray  # (row, column): expected, corrected
+    scenes: OtherScenes  # what may stand in its scene's place
+    residual: FloatArray  # (probe,)
+    nuisances: Columns  # (probe,), by name
+    responses: FloatArray  # (change, probe), 0 where a change cannot be asked
+    offset: FloatArray  # (probe,): of one DN more in every pixel
+    brighter: FloatArray  # (probe,): of 1 % more light
+    pattern: FloatArray  # (probe, wave): what 1 % of a changed gain map does by chance, its smooth part
+    pattern_jitter: dict[FixedPattern, FloatArray]  # (probe,): variance of the rest, by what that is
+    lines: FloatArray  # (2, probe): variance of what 1 DN of noise common to rows (to columns) does
+    lit_lines: FloatArray  # (2, probe): the same of 1 % of the light
+    uneven: dict[int, FloatArray]  # (shape, probe), by number of change: more of it in one part of the panel
+    tiles: dict[int, FloatArray]  # (probe, tile), alike: what 1 % of changed gains of its tiles does by chance
 
     def __len__(self) -> int:
         return len(self.residual)
+
+    @property
+    def session(self) -> SessionSeries:
+        """The series."""
+        return self.view.session
 
 
 def series_block(
     probes: SeriesProbes,
     frame: MeanFrame,
+    *,
+    summary: SeriesSummary,
+    scenes: OtherScenes,
     asked: Sequence[Asked],
     moved: Sequence[Moved | None],
     nuisances: Columns,
 ) -> SeriesBlock:
-    """One series in numbers.
-
-    Args:
-        probes: of this series.
-        frame: its mean frame against the model.
-        asked: changes.
-        moved: what each does to this series.
-        nuisances: responses (probe,) by name.
-    """
+    """One series in numbers; moved: what each change that was asked does to it; nuisances: responses (probe,) by name."""
     signal, shrink = frame.signal_DN, probes.shrink
-    responses = np.zeros((len(asked), len(probes)))
-    known = [(number, found) for number, found in enumerate(moved) if found is not None]
-    if known:
-        responses[[number for number, _ in known]] = probes.responses([found for _, found in known])
-    patterns = dict.fromkeys(
-        _pattern_of(_values_of(item)) for item in asked if _random_of(item.change.label) == "pixels"
-    )
+    # what is random of a change; nothing of a nuisance
+    labels = [item.change.label for item in asked]
+    random = [EFFECTS[label].variation.random if label in EFFECTS else "" for label in labels]
+    patterns = dict.fromkeys(_pattern_of(_values_of(asked[at])) for at, kind in enumerate(random) if kind == "pixels")
     pattern, jitter = changed_gain_pattern(probes, signal, patterns)
-    by_side = uneven(
-        probes,
-        {number: found[0] for number, found in known if _random_of(asked[number].change.label) == "sides"},
-        signal.shape,
-    )
+    sides = {at: found[0] for at, found in enumerate(moved) if found is not None and random[at] == "sides"}
+    by_side = uneven(probes, sides, signal.shape)
     tiles = {
-        number: changed_tiles(probes, signal, one) * shrink[:, None]
+        number: changed_tiles(probes, signal, TilePattern.of(_values_of(item), rms=0.01)) * shrink[:, None]
         for number, item in enumerate(asked)
-        if not item.failed and (one := _tiles_of(item)) is not None
+        if random[number] == "tiles" and not item.failed
     }
     lines, context = noise_of_lines(probes) * shrink**2, probes.series.context
     return SeriesBlock(
-        session=probes.series.session,
-        names=probes.names,
+        view=SeriesView(
+            session=probes.series.session,
+            summary=summary,
+            expected=probes.series.expected,
+            signal_DN=np.asarray(signal, np.float32),
+            residual_DN=np.asarray(frame.residual_DN, np.float32),
+            noise_DN=np.sqrt(frame.quantum_DN2 + frame.white_DN2).astype(np.float32),
+            mask=frame.mask,
+        ),
+        probes=probes,
+        signal_DN=signal,
+        scenes=scenes,
         residual=probes.residual(frame.residual_DN),
-        sd=probes.sd,
-        noise=probes.noise,
         nuisances=nuisances,
-        responses=responses,
+        responses=probes.responses(moved),
         offset=offset_of_later(probes) * shrink,
         brighter=brighter(probes, signal) * shrink,
         pattern=pattern * shrink[:, None],
@@ -114,13 +124,6 @@ def series_block(
         uneven={number: columns * shrink for number, columns in by_side.items()},
         tiles=tiles,
     )
-
-
-def _tiles_of(asked: Asked) -> TilePattern | None:
-    """Tiles whose gains a change draws; None: it has nothing to do with tiles."""
-    if _random_of(asked.change.label) != "tiles":
-        return None
-    return TilePattern.of(_values_of(asked), rms=0.01)
 
 
 def _pattern_of(values: Mapping[str, float]) -> FixedPattern:
@@ -134,14 +137,7 @@ def _values_of(asked: Asked) -> dict[str, float]:
     return dict(EFFECTS[effect.id].values(effect.parameters))
 
 
-def _random_of(label: str) -> str:
-    """What is random of a change; nothing of a nuisance."""
-    return EFFECTS[label].variation.random if label in EFFECTS else ""
-
-
-def by_chance(
-    variant: Variant, blocks: Sequence[SeriesBlock], row: int, readout_ms: float | None
-) -> NDArray[np.float64] | None:
+def by_chance(variant: Variant, blocks: Sequence[SeriesBlock], row: int, readout_ms: float | None) -> FloatArray | None:
     """Random responses (probe, factor) a unit of strength; None: the effect does nothing by chance.
 
     A drifting output moves each lit series' level and trend by chance; a dark's drift or a heel may be uneven over the panel;
@@ -165,7 +161,7 @@ def by_chance(
     return _of_output(variant, blocks, readout_ms) if random == "output" else None
 
 
-def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: float) -> NDArray[np.float64] | None:
+def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: float) -> FloatArray | None:
     """Variance (probe,) a unit of strength squared that an effect gives each probe by itself; None: none.
 
     A gain map changes from pixel to pixel or from column to column; lines of a few frames differ by chance in their means.
@@ -190,7 +186,7 @@ def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: fl
     )
 
 
-def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: float | None) -> NDArray[np.float64] | None:
+def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: float | None) -> FloatArray | None:
     """What a wandering output does by chance (probe, factor): levels of lit series together, trend and common factor of each."""
     size = sum(map(len, blocks))
     lit = [
@@ -209,13 +205,13 @@ def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: floa
         np.multiply.outer(block.brighter, shares, out=levels[place])
         request = block.session.request
         profiles = dict(time_templates(request.frames))
-        for index, name in enumerate(block.names):
+        for index, (name, sd) in enumerate(zip(block.probes.names, block.probes.sd, strict=True)):
             if name.statistic.startswith("trend"):
                 along = wanders.along(profiles[name.statistic.removeprefix("trend ")], request, readout_ms)
-                single.append((place.start + index, 0.01 * along / math.sqrt(request.frames) / block.sd[index]))
+                single.append((place.start + index, 0.01 * along / math.sqrt(request.frames) / sd))
             elif name.statistic == "frame_factor":
                 steps = wanders.steps(request, readout_ms)
-                single.append((place.start + index, 0.5 * steps / block.sd[index]))
+                single.append((place.start + index, 0.5 * steps / sd))
     alone = np.zeros((size, len(single)))
     for column, (probe, amount_of_one) in enumerate(single):
         alone[probe, column] = amount_of_one

@@ -1,13 +1,13 @@
 """How one series is turned into standardised numbers: what its mean frame is projected on, and its scalar probes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
 from ...generator.line.rounding import variance_kept_by_means
+from ..arrays import BoolArray, FloatArray, RealArray
 from ..model import changes as scales
 from ..model.calibrated_maps import CalibratedMaps
 from ..model.changes import Variant
@@ -21,40 +21,32 @@ from ..probes.map_probes import MapProjection, Template, edge_templates, smooth_
 from ..probes.probes import ProbeName, Scalar
 from ..probes.registration import RENDER_SHARE, render_variance
 from ..probes.straight_edge import covered_scene, distance_px, scatter_share
-from ..session.even_maps import NEIGHBOURS_PX, Map, full_size, local_range, near_steps, signal_map
+from ..probes.tile_seams import SeenSeams, seams_in
+from ..session.even_maps import NEIGHBOURS_PX, Map, full_size, local_range, mean_over, near_steps, signal_map
 from ..session.summaries import LEAST_NOISE_DN2, ROUNDED_SHARE, SeriesSummary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeanFrame:
-    """A series' corrected mean frame against the model; maps (row, column).
+    """A series' corrected mean frame against the model; maps (row, column)."""
 
-    Fields: signal_DN: expected; residual_DN: measured less expected; mask: pixels that are compared; quantum_DN2, white_DN2: variance
-    of the mean frame, dark's and gain map's share included, correlated as quanta are, and white; rendered: share of the local range
-    to which pixels that an edge cuts are drawn.
-    """
-
-    signal_DN: NDArray[np.float64]
-    residual_DN: NDArray[np.float64]
-    mask: NDArray[np.bool_]
-    quantum_DN2: NDArray[np.float64]
-    white_DN2: NDArray[np.float64]
-    rendered: float
+    signal_DN: FloatArray  # expected
+    residual_DN: FloatArray  # measured less expected
+    mask: BoolArray  # pixels that are compared
+    quantum_DN2: FloatArray  # variance, dark's and gain map's share included, correlated as quanta are
+    white_DN2: FloatArray  # the same, white
+    rendered: float  # share of the local range to which pixels that an edge cuts are drawn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeriesProbes:
-    """The probes of one series: projections of its mean frame, then scalars.
-
-    Fields: series; projection; scalars: measured; shrink (probe,): what each number is multiplied with to have unit noise again once
-    the floor of what edges show is added; rendered: see `MeanFrame`.
-    """
+    """The probes of one series: projections of its mean frame, then scalars."""
 
     series: SeriesModel
     projection: MapProjection
-    scalars: tuple[Scalar, ...]
-    shrink: NDArray[np.float64]
-    rendered: float
+    scalars: tuple[Scalar, ...]  # measured
+    shrink: FloatArray  # (probe,): factor that gives unit noise again once noise of lines that is no effect is added
+    rendered: float  # see `MeanFrame`
 
     def __len__(self) -> int:
         return len(self.shrink)
@@ -66,57 +58,77 @@ class SeriesProbes:
         return [*self.projection.names, *scalars]
 
     @property
-    def sd(self) -> NDArray[np.float64]:
+    def sd(self) -> FloatArray:
         """Standard deviation (probe,) of scalar probes in their unit; 1 for map probes."""
         return np.concatenate([np.ones(len(self.projection)), [probe.sd for probe in self.scalars]])
 
     @property
-    def noise(self) -> NDArray[np.float64]:
+    def noise(self) -> FloatArray:
         """Counting noise's share (probe,) of each probe's standard deviation."""
         shares = [probe.sampling_sd / probe.sd for probe in self.scalars]
         return np.concatenate([np.ones(len(self.projection)), shares]) * self.shrink
 
-    def residual(self, residual_DN: NDArray[np.float64]) -> NDArray[np.float64]:
+    def residual(self, residual_DN: FloatArray) -> FloatArray:
         """Measured less expected (probe,), standardised; residual_DN: of the mean frame (row, column)."""
         expected = self.series.scalars
         scalars = np.array([(probe.value - expected[probe.name]) / probe.sd for probe in self.scalars])
         return np.concatenate([self.projection.apply(residual_DN), scalars]) * self.shrink
 
-    def responses(self, moved: Sequence[Moved]) -> NDArray[np.float64]:
-        """Responses (change, probe), standardised, to changes of the mean frame and of the scalars."""
-        expected = self.series.scalars
-        maps = self.projection.apply_each([image for image, _ in moved])
-        scalars = np.array(
-            [
-                [
-                    (values.get(probe.name, expected[probe.name]) - expected[probe.name]) / probe.sd
-                    for _, values in moved
-                ]
-                for probe in self.scalars
+    def responses(self, moved: Sequence[Moved | None]) -> FloatArray:
+        """Responses (change, probe), standardised, to changes of mean frame and scalars; 0 where one cannot be asked."""
+        result = np.zeros((len(moved), len(self)))
+        known = {number: found for number, found in enumerate(moved) if found is not None}
+        if known:
+            expected = self.series.scalars
+            maps = self.projection.apply_each([image for image, _ in known.values()])
+            scalars = [
+                [(values.get(one.name, expected[one.name]) - expected[one.name]) / one.sd for one in self.scalars]
+                for _, values in known.values()
             ]
-        ).reshape(-1, len(moved))
-        return np.asarray(np.concatenate([maps, scalars.T], axis=1) * self.shrink)
+            result[list(known)] = np.concatenate([maps, scalars], axis=1) * self.shrink
+        return result
 
-    def of_maps(self, images_DN: NDArray[np.floating]) -> NDArray[np.float64]:
+    def of_maps(self, images_DN: RealArray) -> FloatArray:
         """Responses (image, probe), not shrunk, to changes of the mean frame alone (image, row, column)."""
         return self.without_scalars(self.projection.apply(images_DN))
 
-    def without_scalars(self, projected: NDArray[np.float64]) -> NDArray[np.float64]:
+    def without_scalars(self, projected: FloatArray) -> FloatArray:
         """Responses (image, probe) of which the map probes' are given (image, map probe) and the scalars' are 0."""
         return np.pad(projected, ((0, 0), (0, len(self.scalars))))
 
-    def of_scalars(self, change: Callable[[Scalar], float]) -> NDArray[np.float64]:
+    def of_scalars(self, change: Callable[[Scalar], float]) -> FloatArray:
         """Response (probe,), not shrunk, to changes of the scalars alone, each in its unit."""
         return np.concatenate([np.zeros(len(self.projection)), [change(probe) / probe.sd for probe in self.scalars]])
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredSession:
+    """What the frames of a session show, and what the base twin expects of them."""
+
+    expected: SessionModel
+    pictures: Mapping[str, FloatArray]  # (row, column): corrected mean frames, DN, by name of series
+    summaries: Mapping[str, SeriesSummary]  # of the frames' noise, by name
+    memory: Mapping[str, tuple[float, int] | None]  # of outlying pixels in darks, see `memory_of`, by name
+    copies: Mapping[str, int]  # of frames, by name of the series that counts them
+    clean: BoolArray  # (row, column): pixels in use that do not stand out
+    lasting: BoolArray  # (row, column): pixels whose level lasts in a later dark
+    outliers: int  # how many others stand out in any series
+    skipped: tuple[str, ...]  # what could not be used and why
+
+    def seams(self) -> SeenSeams | None:
+        """Where flats that came after calibration show that tiles meet; None: there is none."""
+        changes, weights = [], []
+        for one in self.expected.series:
+            if one.session.series.kind == "flat" and not one.session.calibrates:
+                signal = signal_map(one.expected, self.clean.shape)
+                changes.append(self.pictures[one.name] / signal - 1.0)
+                variance = mean_over(one.expected.quantum_variance_DN2 + one.expected.white_variance_DN2, self.clean)
+                weights.append(self.summaries[one.name].frames * mean_over(signal, self.clean) ** 2 / variance)
+        return seams_in(changes, weights, self.clean)
+
+
 def mean_frame(
-    one: SeriesModel,
-    corrected_DN: NDArray[np.float64],
-    maps: CalibratedMaps,
-    *,
-    frames: int,
-    side: int,
+    one: SeriesModel, corrected_DN: FloatArray, maps: CalibratedMaps, *, frames: int, side: int
 ) -> MeanFrame:
     """A series' corrected mean frame (row, column) against the model.
 
@@ -154,24 +166,18 @@ def mean_frame(
     )
 
 
-def _rendered(
-    one: SeriesModel, residual_DN: NDArray[np.float64], signal_DN: NDArray[np.float64], mask: NDArray[np.bool_]
-) -> float:
+def _rendered(one: SeriesModel, residual_DN: FloatArray, signal_DN: FloatArray, mask: BoolArray) -> float:
     """Share of the local range to which pixels at edges are drawn: of a straight edge as it is seen, of others as assumed."""
     request = one.session.request
     if request.scene_kind != "edge" or request.thickness_mm is None:
         return RENDER_SHARE
     away = distance_px(request.thickness_mm)
-    return (
-        RENDER_SHARE
-        if away is None
-        else min(RENDER_SHARE, scatter_share(residual_DN, local_range(signal_DN), mask, away))
-    )
+    if away is None:
+        return RENDER_SHARE
+    return min(RENDER_SHARE, scatter_share(residual_DN, local_range(signal_DN), mask, away))
 
 
-def variance_of_what_came(
-    variance_DN2: NDArray[np.float64], signal_DN: NDArray[np.float64], corrected_DN: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def variance_of_what_came(variance_DN2: FloatArray, signal_DN: FloatArray, corrected_DN: FloatArray) -> FloatArray:
     """Variance (row, column), DN^2, that the light which is there gives a frame, by the mean ratio of variance to signal.
 
     Without noise of the detector's own, a deep shadow has none by the model, and light that strays there the evidence of thousands.
@@ -183,32 +189,18 @@ def variance_of_what_came(
 
 
 def series_probes(
-    session: SessionModel,
+    measured: MeasuredSession,
     one: SeriesModel,
     frame: MeanFrame,
     *,
-    summary: SeriesSummary,
     moved: Sequence[Moved | None],
     variants: Sequence[Variant],
-    all_outliers: int,
-    memory: tuple[float, int] | None,
-    copies: int,
-    lasting: NDArray[np.bool_],
 ) -> SeriesProbes:
-    """The probes of one series.
+    """The probes of one series; moved: what changes do to it, those of variants' strengths first.
 
-    Args:
-        session: all series as the base twin expects them.
-        one: this series.
-        frame: its mean frame against the model.
-        summary: what its frames' noise says.
-        moved: what the changes do to it, those of variants' strengths first.
-        variants: effects to try; the mean frame is projected on what each does at its first strength.
-        all_outliers: pixels that stand out in any series.
-        memory: of outlying pixels in this series, see `memory_of`.
-        copies: of frames, that this series counts.
-        lasting: pixels (row, column) whose level lasts in a later dark; they are no outliers.
+    Its mean frame is projected on what the first strength of each variant does.
     """
+    session, summary = measured.expected, measured.summaries[one.name]
     first = [(variant, moved[rows.start]) for variant, rows in zip(variants, strength_rows(variants), strict=True)]
     projection = MapProjection(
         _templates(session, one, frame, [(variant, found[0]) for variant, found in first if found is not None]),
@@ -220,18 +212,12 @@ def series_probes(
     )
     kind, good, clean = one.session.series.kind, session.maps.good, one.context.good
     pattern, outliers = None, None
-    if kind in ("flat", "dark"):
+    if kind in ("flat", "dark") and not (one.session.calibrates or one.context.rounded):
         lit = frame.signal_DN if kind == "flat" else None
         pattern = pattern_statistics(frame.residual_DN, lit, clean=clean, good=good)
-        noise = frame.quantum_DN2 + frame.white_DN2
-        least_DN = scales.DUST_LIMIT * frame.signal_DN if kind == "flat" else None
+        noise, least_DN = frame.quantum_DN2 + frame.white_DN2, None if lit is None else scales.DUST_LIMIT * lit
         outliers = count_outliers(
-            frame.residual_DN,
-            noise,
-            float(pattern[0]),
-            clean=clean,
-            good=good & ~lasting,
-            least_DN=least_DN,
+            frame.residual_DN, noise, float(pattern[0]), clean=clean, good=good & ~measured.lasting, least_DN=least_DN
         )
     scalars = measured_scalars(
         summary,
@@ -240,10 +226,10 @@ def series_probes(
         dark_mean_DN=float(np.mean(session.maps.darks.under(one.session)[clean])),
         pattern=pattern,
         outliers=outliers,
-        all_outliers=all_outliers,
-        memory=memory,
-        copies=copies,
-        lasting=int(np.count_nonzero(lasting)),
+        all_outliers=measured.outliers,
+        memory=measured.memory.get(one.name),
+        copies=measured.copies.get(one.name, 0),
+        lasting=int(np.count_nonzero(measured.lasting)),
     )
     scalars = [probe for probe in scalars if probe.name in one.scalars]
     if one.placement is not None and one.tells_displacement:
@@ -263,7 +249,7 @@ def series_probes(
     )
 
 
-def _standing_still(summary: SeriesSummary) -> NDArray[np.bool_]:
+def _standing_still(summary: SeriesSummary) -> BoolArray:
     """Pixels (row, column) whose noise hardly reaches over a step of the ADC, by what their neighbours do as well."""
     from scipy.ndimage import uniform_filter
 
@@ -280,8 +266,11 @@ def _templates(
         open_map = np.full(signal.shape, float(np.max(signal)))
         templates += transmission_templates(signal, open_map, frame.mask)
         templates += edge_templates(signal)
-    if kind == "afterglow":
-        templates += _ghost_templates(one, session.series, signal.shape)
+    before = [other for other in session.series if other.session.series.index < one.session.series.index]
+    lit = [other for other in before if other.session.request.beam_on]
+    if kind == "afterglow" and lit:
+        ghost = signal_map(lit[-1].expected, signal.shape)
+        templates.append(Template(axis="time", name=f"ghost of {lit[-1].name}", unit="1", image=ghost))
     templates += [
         Template(
             axis=EFFECTS[variant.effect].shows.axis,
@@ -293,15 +282,3 @@ def _templates(
         if image.shape == signal.shape
     ]
     return templates
-
-
-def _ghost_templates(one: SeriesModel, series: Sequence[SeriesModel], shape: tuple[int, ...]) -> list[Template]:
-    """The picture exposed last before an afterglow."""
-    lit = [
-        other
-        for other in series
-        if other.session.request.beam_on and other.session.series.index < one.session.series.index
-    ]
-    if not lit:
-        return []
-    return [Template(axis="time", name=f"ghost of {lit[-1].name}", unit="1", image=signal_map(lit[-1].expected, shape))]

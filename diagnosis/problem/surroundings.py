@@ -3,26 +3,19 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS, AppliedEffect
+from ..arrays import FloatArray
 from ..model import changes as scales
 from ..model.responses import SessionModel
 from .series_probes import SeriesProbes
 
 
-def border_inflow(
-    session: SessionModel, series: Sequence[SeriesProbes], effect: AppliedEffect
-) -> NDArray[np.float64] | None:
+def border_inflow(session: SessionModel, series: Sequence[SeriesProbes], effect: AppliedEffect) -> FloatArray | None:
     """What an effect may let in by chance (probe, placement of a scene), a unit of its strength; None: it brings nothing in.
 
     That is what comes in if the picture goes on as it ends, less what comes in if it mirrors. An edge that crosses a border and runs
     on straight lets in twice that. Series of one placement have the same surroundings.
-
-    Args:
-        session: all series as the base twin expects them.
-        series: probes of all of them, in order of time.
-        effect: at a strength; it takes the place of the same one, if the base has that.
     """
     if EFFECTS[effect.id].variation.random != "surroundings":
         return None
@@ -36,7 +29,7 @@ def border_inflow(
     )
 
 
-def _of_series(session: SessionModel, probes: SeriesProbes, effect: AppliedEffect) -> NDArray[np.float64]:
+def _of_series(session: SessionModel, probes: SeriesProbes, effect: AppliedEffect) -> FloatArray:
     """The same of one series (probe,)."""
     if probes.series.session.series.kind != "object":
         return np.zeros(len(probes))

@@ -1,12 +1,13 @@
 """The diagnosis in plain words: a headline, a table of causes, and a sentence for each thing that is to be said."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 from ...checks.findings import FindingCode
 from ...generator.effects import EFFECTS
 from ...results import Table
 from ..inference.inference import UNKNOWN, title_of
-from ..judgement.answer import EXPLAINED, Diagnosis, Place
+from ..judgement.answer import EXPLAINED, Cause, Diagnosis, Place
 from ..judgement.held_out import Gap
 from .words import axis_text, family_text, meaning_text, nuisance_text, place_text, share_text, strength_text, when_text
 
@@ -21,6 +22,10 @@ _FINDING_TITLES = {
     FindingCode.STOPS: "Numbers are cut off early",
     FindingCode.SPECTRUM: "The flats fit no spectrum",
 }
+
+
+def _likely(cause: Cause) -> str:
+    return f"{title_of(cause.effect)}, {strength_text(cause)}, probability {cause.probability:.2f}"
 
 
 def _percent(value: tuple[float, float, float]) -> str:
@@ -58,9 +63,7 @@ def _where(places: Sequence[Place]) -> list[str]:
 
 def compared_text(diagnosis: Diagnosis) -> str:
     """What was compared, what was left out, and what these series could not show."""
-    kinds: dict[str, int] = {}
-    for view in diagnosis.compared.views:
-        kinds[view.session.series.kind] = kinds.get(view.session.series.kind, 0) + 1
+    kinds = Counter(view.session.series.kind for view in diagnosis.compared.views)
     told = ", ".join(f"{number} of kind {kind}" for kind, number in kinds.items())
     text = f"{sum(kinds.values())} series were compared ({told})"
     if diagnosis.warnings:
@@ -110,10 +113,7 @@ def verdict_text(diagnosis: Diagnosis) -> str:
     """Where, which and how far, without what the session could not show."""
     if not _explained(diagnosis):
         return " ".join(_not_explained(diagnosis))
-    named = "; ".join(
-        f"{title_of(cause.effect)}, {strength_text(cause)}, probability {cause.probability:.2f}"
-        for cause in diagnosis.leading
-    )
+    named = "; ".join(map(_likely, diagnosis.leading))
     return " ".join([*_where(diagnosis.where), f"{_relation(diagnosis.gap)}: {named}.", *_fall(diagnosis)])
 
 
@@ -222,12 +222,7 @@ def _not_explained(diagnosis: Diagnosis) -> list[str]:
             who, where = "The other series agree with the twin", " in them"
         return [f"{who} (probability {diagnosis.probability_no_gap:.2f} that nothing is missing{where}).", figures]
     if diagnosis.verdict == "unknown_effect":
-        return [
-            *_where(diagnosis.where),
-            _unknown(diagnosis),
-            *_signature(diagnosis),
-            figures,
-        ]
+        return [*_where(diagnosis.where), _unknown(diagnosis), *_signature(diagnosis), figures]
     named = ", ".join(f"{title} ({probability:.2f})" for title, probability in rivals(diagnosis))
     measure = diagnosis.next_measurement
     return [
@@ -250,11 +245,7 @@ def _unknown(diagnosis: Diagnosis) -> str:
 def _less_likely(diagnosis: Diagnosis) -> list[str]:
     """What else may be there, beside or instead of what is named, in one sentence."""
     others = [cause for cause in diagnosis.causes if cause not in diagnosis.leading]
-    told = [
-        f"{title_of(cause.effect)}, {strength_text(cause)}, probability {cause.probability:.2f}"
-        for cause in others
-        if cause.probability >= _LEAST_LIKELY
-    ]
+    told = [_likely(cause) for cause in others if cause.probability >= _LEAST_LIKELY]
     if diagnosis.probability_unknown >= _LEAST_LIKELY:
         told.append(f"{title_of(UNKNOWN)}, probability {diagnosis.probability_unknown:.2f}")
     return [f"Less likely, but not out of the question: {'; '.join(told)}."] if told else []

@@ -6,13 +6,13 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...reports import AFTER, BEFORE, Bars, Chart, Line, Picture, Points, Rule
 from ...reports.chart import SERIES_COLOURS, SHAPES, asinh_ticks, rows_px
+from ..arrays import FloatArray, RealArray
 from ..inference.inference import title_of
 from ..judgement.answer import Diagnosis
-from ..problem.problem import SeriesView
+from ..problem.series_block import SeriesView
 from ..session.even_maps import NEIGHBOURS_PX
 from .words import axis_text, statistic_text
 
@@ -24,14 +24,14 @@ _WIDEST_LINEAR = 20.0  # times noise: beyond it bars are drawn on a logarithm
 _MOST_HYPOTHESES, _LEAST_PROBABILITY = 6, 1e-4
 
 
-def _smoothed_z(view: SeriesView, residual: NDArray[np.floating]) -> NDArray[np.float64]:
+def _smoothed_z(view: SeriesView, residual: RealArray) -> FloatArray:
     """Residual over noise after averaging over neighbours (row, column)."""
     from scipy.ndimage import uniform_filter
 
     inside = view.mask.astype(np.float64)
     weight = uniform_filter(inside, NEIGHBOURS_PX)
 
-    def smoothed(image: NDArray[np.floating]) -> NDArray[np.float64]:
+    def smoothed(image: RealArray) -> FloatArray:
         kept = np.where(view.mask, image, 0.0).astype(np.float64)
         return np.asarray(uniform_filter(kept, NEIGHBOURS_PX) / np.maximum(weight, 1e-9))
 
@@ -39,14 +39,10 @@ def _smoothed_z(view: SeriesView, residual: NDArray[np.floating]) -> NDArray[np.
     return np.asarray(np.where(weight > 0.2, value / np.sqrt(np.maximum(noise, 1e-30)), np.nan))
 
 
-def gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]]) -> list[Picture]:
-    """Residual mean frames in units of one pixel's noise, 5 x 5 average: before and after.
+def gap_maps(diagnosis: Diagnosis, after: Sequence[RealArray]) -> list[Picture]:
+    """Residual mean frames in units of one pixel's noise, 5 x 5 average: before, and after with residuals (row, column), DN.
 
     Series of which the effects take most away come first; where there are none, those with most gap.
-
-    Args:
-        diagnosis: with what was compared.
-        after: (series) residuals (row, column) with the effects added, DN.
     """
     views = diagnosis.compared.views
     pictures = []
@@ -72,7 +68,7 @@ def gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]]) -> lis
     return pictures
 
 
-def _telling_views(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]]) -> list[int]:
+def _telling_views(diagnosis: Diagnosis, after: Sequence[RealArray]) -> list[int]:
     """Views with the most to show, one a kind, scene and voltage: what is taken of the gap, or the gap where that is nothing."""
     problem = diagnosis.compared
     power, taken = np.zeros(len(problem.views)), np.zeros(len(problem.views))
@@ -86,21 +82,14 @@ def _telling_views(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]]) 
             taken[index] = float(np.mean(less[view.mask]))
     if float(taken.max(initial=0.0)) > 0.0:
         power = taken
-    seen: set[tuple[Any, ...]] = set()
-    result = []
+    first: dict[tuple[Any, ...], int] = {}
     for index in np.argsort(-power):
         series = problem.views[index].session.series
-        key = (series.kind, series.scene, series.kV)
-        if key in seen:
-            continue
-        seen.add(key)
-        result.append(int(index))
-        if len(result) == _MAPS:
-            break
-    return result
+        first.setdefault((series.kind, series.scene, series.kV), int(index))
+    return list(first.values())[:_MAPS]
 
 
-def transmission_curves(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]]) -> list[Chart]:
+def transmission_curves(diagnosis: Diagnosis, after: Sequence[RealArray]) -> list[Chart]:
     """Gap in percent of the open field against -log transmission, every scene with known thickness; before and after."""
     lines: tuple[list[Line], list[Line]] = ([], [])
     colours: dict[str, str] = {}  # of a sort of scene
@@ -165,32 +154,13 @@ def gap_chart(parts: Sequence[tuple[str, float, float, float]], *, added: bool) 
     largest = max(max(row[1:]) for row in rows)
     long = largest > _WIDEST_LINEAR
     smallest = 0.7 * min(min(value for value in row[1:] if value > 0) for row in rows)
+    before, after, floor = ([row[column] for row in rows] for column in (1, 2, 3))
+    bars = [(y - 0.19, before, BEFORE, "before"), (y + 0.19, after, AFTER, "after")][: 2 if added else 1]
     marks: list[Any] = [
-        Bars(
-            y=y - 0.19,
-            length=[row[1] for row in rows],
-            thickness=0.34,
-            colour=BEFORE,
-            label="before",
-            names=names,
-            numbers=True,
-        )
+        Bars(y=place, length=value, thickness=0.34, colour=colour, label=label, names=names, numbers=True)
+        for place, value, colour, label in bars
     ]
-    if added:
-        after = [row[2] for row in rows]
-        marks.append(
-            Bars(y=y + 0.19, length=after, thickness=0.34, colour=AFTER, label="after", names=names, numbers=True)
-        )
-    marks.append(
-        Points(
-            x=[row[3] for row in rows],
-            y=y,
-            colour="#111111",
-            label="noise alone",
-            shape="diamond",
-            names=names,
-        )
-    )
+    marks.append(Points(x=floor, y=y, colour="#111111", label="noise alone", shape="diamond", names=names))
     return Chart(
         name="held_out_gap",
         title="Gap on series that the fit did not use",

@@ -53,23 +53,18 @@ def write_report(
     detection: Detection | None = None,
     interactive: bool | None = None,
 ) -> Path:
-    """Write the page; returns its path.
+    """Write the page of a diagnosis and its plain values; returns its path.
 
-    Args:
-        diagnosis, answer: the result, and its plain values.
-        path: of the page.
-        version: of raytwin.
-        detection: of the task that was asked, if one was.
-        interactive: figures that answer to the pointer; None: where Bokeh is installed.
+    detection: of the task that was asked, if one was; interactive: figures answer to the pointer; None: where Bokeh is installed.
     """
     after = residuals_after(diagnosis)
     maps = gap_maps(diagnosis, after)
     # of the series with most gap; what changes the noise of frames or one line of pixels takes little of such a picture
     first = (2 if _shows(maps) else 0) if diagnosis.added else 1
-    groups: dict[str, list[Figure]] = {
-        "map": [*maps],
-        "curve": [*transmission_curves(diagnosis, after)],
-        "task": [] if detection is None else [*detection.charts],
+    groups: dict[str, Sequence[Figure]] = {
+        "map": maps,
+        "curve": transmission_curves(diagnosis, after),
+        "task": () if detection is None else detection.charts,
     }
     figures: dict[str, Figure] = {
         "held_out": held_out_chart(diagnosis),
@@ -130,29 +125,29 @@ _REMEDIES = {
 }
 
 
+def _step(text: str, command: str = "") -> dict[str, str]:
+    return {"text": text, "command": command}
+
+
 def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
     """What to do with the answer, most useful first: a sentence each, with a command where there is one."""
-
-    def step(text: str, command: str = "") -> dict[str, str]:
-        return {"text": text, "command": command}
-
     measure = diagnosis.next_measurement
     measured = (
-        [step(f"Measure: {measure['text']}.", "raytwin diagnose SESSION -o again --also NEW_SESSION")]
+        [_step(f"Measure: {measure['text']}.", "raytwin diagnose SESSION -o again --also NEW_SESSION")]
         if measure and measure.get("text")
         else []
     )
     if diagnosis.findings:
         measured = [
-            *(step(text) for text in dict.fromkeys(_REMEDIES.get(item.code, _LABELS) for item in diagnosis.findings)),
-            step("Diagnose the session again.", "raytwin diagnose SESSION -o diagnosis"),
+            *(_step(text) for text in dict.fromkeys(_REMEDIES.get(item.code, _LABELS) for item in diagnosis.findings)),
+            _step("Diagnose the session again.", "raytwin diagnose SESSION -o diagnosis"),
             *measured,
         ]
     if diagnosis.no_gap_but_findings:
         return measured
     if diagnosis.verdict == "no_gap":
         return [
-            step(
+            _step(
                 "Use the twin as it is.",
                 "raytwin generate TWIN REFERENCES --low SETTING --high SETTING -n 80 -o images.h5",
             ),
@@ -161,35 +156,32 @@ def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
     if diagnosis.verdict == "unknown_effect":
         return [
             *measured,
-            step("Look at the maps and probes below: the place of the gap says which part of the line to inspect."),
-            step("Describe the effect in a file of your own, if you know its equation (documentation: effects)."),
+            _step("Look at the maps and probes below: the place of the gap says which part of the line to inspect."),
+            _step("Describe the effect in a file of your own, if you know its equation (documentation: effects)."),
         ]
     if diagnosis.verdict == "ambiguous":
         return [*measured, *_confirmed_by(diagnosis.causes[:3])]
     if diagnosis.gap.tested and not (diagnosis.gap.falls or diagnosis.gap.at_floor):
         return [
-            step(
+            _step(
                 "Keep the twin as it was: the gap on series that the fit did not use does not fall with the improved twin beside"
                 " this page."
             ),
             *measured,
-            step("Look at the maps and probes below: what is left says where the law is off."),
+            _step("Look at the maps and probes below: what is left says where the law is off."),
             *_confirmed_by(diagnosis.leading),
         ]
-    use = step(
+    use = _step(
         "Use the improved twin that lies beside this page; every command takes it.",
         "raytwin predict twin.h5 --kv 60 --power-w 40 --exposure-ms 20",
     )
     return [*([use] if diagnosis.added else []), *measured, *_confirmed_by(diagnosis.leading)]
 
 
-def _confirmed_by(causes: "list[Cause] | tuple[Cause, ...]") -> list[dict[str, str]]:
+def _confirmed_by(causes: Sequence[Cause]) -> list[dict[str, str]]:
     """The measurement that shows each cause by itself."""
     known = [cause.effect for cause in causes if cause.effect in EFFECTS]
-    return [
-        {"text": f"To confirm {title_of(effect).lower()}: {EFFECTS[effect].isolated_by}.", "command": ""}
-        for effect in known
-    ]
+    return [_step(f"To confirm {title_of(effect).lower()}: {EFFECTS[effect].isolated_by}.") for effect in known]
 
 
 def _key_figures(diagnosis: Diagnosis) -> list[dict[str, str]]:

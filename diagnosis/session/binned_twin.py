@@ -8,12 +8,12 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...acquisition.binned_frames import means_of_bins
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.line.twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, Twin, gaussian_spread
 from ...generator.spread.psf import Spread, blur_variance_share
+from ..arrays import FloatArray
 
 _MODEL = "sampled"
 _WIDEST = 8.0  # bins that light may spread over
@@ -22,15 +22,9 @@ _WIDEST = 8.0  # bins that light may spread over
 def binned_twin(twin: Twin, factor: int) -> Twin:
     """The twin of means over factor x factor pixels; rows and columns that fill no square are left out as of frames.
 
-    With n = factor: gain, photon-transfer slope and DN a keV are 1 / n^2 of a pixel's, the electronic variance too; the spread is the
-    one that leaves the same share of the quantum variance in a square, quanta counted per square, which
-    is how averaged frames calibrate where light spreads over less than a square: with light of any place in it, edges of squares
-    that an object cuts are drawn too sharp, which looks like a tail that is not there.
-    Squares with a bad pixel are bad. `evidence` stays that of the pixels.
-
-    Args:
-        twin: of the panel's pixels.
-        factor: pixels along each side of a square, 1 or more.
+    With n = factor: gain, photon-transfer slope and DN a keV are 1 / n^2 of a pixel's, the electronic variance too; the spread leaves
+    the same share of the quantum variance in a square, quanta counted per square, which is how averaged frames calibrate where light
+    spreads over less than a square. Squares with a bad pixel are bad. `evidence` stays that of the pixels.
 
     Checked against: twins calibrated from averaged frames (tests/test_diagnosis_binned_twin.py).
     """
@@ -112,14 +106,11 @@ def _level(level: Level, noise: NoiseModel, factor: int) -> Level:
 
 
 def _spectral(spectral: SpectralPosterior, factor: int, *, pitch_known: bool) -> SpectralPosterior:
-    """As many DN fewer a keV as a square has pixels: so many more photons it sees.
-
-    Without a pitch there is none to grow; then the tube's output, whose unit is as unknown, stands for the larger area.
-    """
+    """As many DN fewer a keV as a square has pixels, and so many more photons, or output where there is no pitch."""
     more = 2.0 * math.log(factor)
     moved = {"log_DN_per_keV": -more} | ({} if pitch_known else {"log_output": more})
 
-    def per_bin(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def per_bin(values: FloatArray) -> FloatArray:
         return np.asarray(values + np.array([moved.get(name, 0.0) for name in spectral.names]))
 
     return replace(spectral, samples=per_bin(spectral.samples), best=per_bin(spectral.best))

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
+from ..arrays import BoolArray, FloatArray, RealArray
 
 NEIGHBOURS_PX = 5  # side of the square that a pixel's neighbours are in
 _STEP_SHARE = 0.12  # of the brighter side, among neighbours: more is a step
@@ -16,7 +17,7 @@ NOWHERE: Map = np.zeros((1, 1), np.float32)
 NOWHERE.setflags(write=False)
 
 
-def compact(image: NDArray[np.floating], scale: float) -> Map:
+def compact(image: RealArray, scale: float) -> Map:
     """The map as float32, or (1, 1) where it is the same everywhere to 1e-7 of `scale`."""
     first = float(image.flat[0])
     if float(np.max(image)) - float(np.min(image)) <= 1e-7 * max(scale, 1e-12):
@@ -24,22 +25,22 @@ def compact(image: NDArray[np.floating], scale: float) -> Map:
     return np.asarray(image, dtype=np.float32)
 
 
-def full_size(image: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np.float64]:
+def full_size(image: RealArray, shape: tuple[int, ...]) -> FloatArray:
     """The map (row, column), to be read only."""
     return np.broadcast_to(np.asarray(image, dtype=np.float64), shape)
 
 
-def signal_map(expected: ExpectedSeries, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def signal_map(expected: ExpectedSeries, shape: tuple[int, ...]) -> FloatArray:
     """Expected signal (row, column), DN, to be read only."""
     return full_size(expected.signal_DN, shape)
 
 
-def mean_over(image: NDArray[np.floating], mask: NDArray[np.bool_]) -> float:
+def mean_over(image: RealArray, mask: BoolArray) -> float:
     """Mean of a map over the pixels of a mask (row, column)."""
     return float(np.mean(full_size(image, mask.shape)[mask]))
 
 
-def local_range(signal_DN: NDArray[np.floating], reach: int = 1) -> NDArray[np.float64]:
+def local_range(signal_DN: RealArray, reach: int = 1) -> FloatArray:
     """Largest less least signal (row, column) within `reach` pixels of each, DN."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
@@ -47,10 +48,10 @@ def local_range(signal_DN: NDArray[np.floating], reach: int = 1) -> NDArray[np.f
     return np.asarray(maximum_filter(signal_DN, size) - minimum_filter(signal_DN, size), dtype=np.float64)
 
 
-def near_steps(signal: NDArray[np.floating]) -> NDArray[np.bool_]:
+def near_steps(signal: RealArray) -> BoolArray:
     """Pixels with a step of a signal (row, column) among their neighbours."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     highest, lowest = maximum_filter(signal, NEIGHBOURS_PX), minimum_filter(signal, NEIGHBOURS_PX)
-    steps: NDArray[np.bool_] = (highest - lowest) > _STEP_SHARE * np.maximum(highest, 1e-9)
+    steps: BoolArray = (highest - lowest) > _STEP_SHARE * np.maximum(highest, 1e-9)
     return steps

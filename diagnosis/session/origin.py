@@ -4,10 +4,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...acquisition.acquisition_io import Series
 from ...generator.line.twin import Twin
+from ..arrays import BoolArray, FloatArray
 
 _MOST_SERIES = 12  # of each kind that are looked at
 _SURE = 10.0  # standard deviations of a variance of independent pixels; light spreads over a few
@@ -21,10 +21,6 @@ def made_of(twin: Twin, series: Sequence[Series]) -> bool:
 
     The mean frame of a series lies closer to a map that it is a part of than its own noise allows; to any other map it lies
     further away, by that map's noise as well.
-
-    Args:
-        twin: calibrated from some session.
-        series: of a session with frames of the twin's shape.
     """
     good = twin.maps.bad_pixels == 0
     sure = max(_SURE * math.sqrt(2.0 / max(int(np.count_nonzero(good)), 1)), _LEAST_SHARE)
@@ -38,9 +34,7 @@ def made_of(twin: Twin, series: Sequence[Series]) -> bool:
     return False
 
 
-def _from_maps(
-    twin: Twin, item: Series, mean_DN: NDArray[np.float64], good: NDArray[np.bool_]
-) -> list[NDArray[np.float64]]:
+def _from_maps(twin: Twin, item: Series, mean_DN: FloatArray, good: BoolArray) -> list[FloatArray]:
     """Distance (row, column), DN, of a dark from the twin's, or of a flat from each shape it has for the kV and filters."""
     less_dark_DN = mean_DN - twin.maps.dark_at(item.exposure_ms)
     if item.kind == "dark":
@@ -52,7 +46,7 @@ def _from_maps(
     return [signal_DN - level_DN * one.flat_shape for one in known] if level_DN > 0.0 else []
 
 
-def _mean_and_noise(item: Series, good: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
+def _mean_and_noise(item: Series, good: BoolArray) -> tuple[FloatArray, float]:
     """Mean frame (row, column), DN, and variance of its noise, DN^2; 0 for a single frame, which shows none."""
     total, noise_DN2, last = np.zeros(item.shape), [], None
     for piece in item.iter_frames():
@@ -64,11 +58,8 @@ def _mean_and_noise(item: Series, good: NDArray[np.bool_]) -> tuple[NDArray[np.f
     return total / item.n_frames, float(np.mean(noise_DN2)) / item.n_frames if noise_DN2 else 0.0
 
 
-def _variance(image: NDArray[np.float64], good: NDArray[np.bool_]) -> float:
-    """Variance of what pixels in use have of their own, without the few that a fading ghost's outline or a hot pixel shifts.
-
-    The picture that a lag left fades from frame to frame: counted as noise, it had let another day's darks pass for those of the map.
-    """
+def _variance(image: FloatArray, good: BoolArray) -> float:
+    """Variance of what pixels in use have of their own, without the few that a fading ghost's outline or a hot pixel shifts."""
     from scipy.stats import sigmaclip
 
     steps = np.diff(image, axis=1)[good[:, 1:] & good[:, :-1]]

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...acquisition.acquisition_io import AcquisitionFile, Series
 from ...acquisition.binned_frames import binned
@@ -19,6 +18,7 @@ from ...checks.readings import Explained
 from ...errors import FitError, InputError, RaytwinError
 from ...generator.effects import EFFECTS
 from ...generator.line.twin import Twin
+from ..arrays import FloatArray
 from .binned_twin import binned_twin
 from .binning import LEAST_SIDE, bin_factor, lost_by_binning
 from .origin import made_of
@@ -32,30 +32,22 @@ _CONTRADICTED = "its frames contradict what it states"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreparedSession:
-    """A session ready for its diagnosis.
+    """A session ready for its diagnosis."""
 
-    Fields: acquisition (less the series that cannot be used); exposed (of these, lit ones: what they left in the panel is known);
-    twin; calibrated_elsewhere (the twin was given, and none of these series is in it); contradicted (labels that frames contradict,
-    whose series are left out); findings (labels that frames contradict, whose series are not); other_findings (numbers that stop
-    early, flats that fit no spectrum); left_out (series that are not used, each with the reason); notes (how the session is looked
-    at, and what calibration took in); factor (pixels along each side of a bin);
-    all_pixels (the same series with all pixels); ends_at_zero (names of lit series whose numbers go down to 0 and not below);
-    spectral_point (parameter,): where the twin's spectral nuisances are taken as linear (None: at its best parameters).
-    """
-
-    acquisition: AcquisitionFile
-    exposed: tuple[Series, ...]
+    acquisition: AcquisitionFile  # less the series that cannot be used
+    exposed: tuple[Series, ...]  # of these, lit ones: what they left in the panel is known
     twin: Twin
-    calibrated_elsewhere: bool
-    contradicted: tuple[Finding, ...]
-    findings: tuple[Finding, ...]
-    other_findings: tuple[Finding, ...]
-    left_out: tuple[str, ...]
-    notes: tuple[str, ...]
-    factor: int
-    all_pixels: AcquisitionFile
-    ends_at_zero: frozenset[str]
-    spectral_point: NDArray[np.float64] | None
+    calibrated_elsewhere: bool  # the twin was given, and none of these series is in it
+    contradicted: tuple[Finding, ...]  # labels that frames contradict, whose series are left out
+    findings: tuple[Finding, ...]  # labels that frames contradict, whose series are not
+    other_findings: tuple[Finding, ...]  # numbers that stop early, flats that fit no spectrum
+    left_out: tuple[str, ...]  # series that are not used, each with the reason
+    notes: tuple[str, ...]  # how the session is looked at, and what calibration took in
+    factor: int  # pixels along each side of a bin
+    all_pixels: AcquisitionFile  # the same series with all pixels
+    ends_at_zero: frozenset[str]  # names of lit series whose numbers go down to 0 and not below
+    # (parameter,): where the twin's spectral nuisances are taken as linear; None: at its best parameters
+    spectral_point: FloatArray | None
 
     @property
     def lost(self) -> dict[str, str]:
@@ -89,15 +81,8 @@ def prepare_session(
 ) -> PreparedSession:
     """Check a session's labels, take out what cannot be used, and calibrate its twin where none was given.
 
-    Frames of more than LARGEST_PIXELS are binned, and a given twin with them. Where series whose
-    labels are contradicted cannot calibrate, they are left out.
-
-    Args:
-        acquisition: open file.
-        twin: calibrated elsewhere; None: the session's own series make it.
-        rng: source of randomness.
-        contradicted: labels that frames contradict, whose series are left out.
-        progress: called with the name of each stage.
+    Frames of more than LARGEST_PIXELS are binned, and a given twin with them. Where series whose labels are contradicted cannot
+    calibrate, they are left out. twin: calibrated elsewhere; contradicted: labels whose series are left out.
 
     Raises:
         InputError: nothing can be calibrated or compared; the message says what is missing and what would do.
@@ -163,10 +148,7 @@ def prepare_session(
 
 
 def _taken_in(twin: Twin, factor: int) -> tuple[str, ...]:
-    """What calibration took in that the catalogue has as an effect; factor: pixels along the side of the twin's squares.
-
-    A tail that the calibrating series leave open, its interval down to none, is none that was found.
-    """
+    """What calibration took in that the catalogue has as an effect: a tail whose interval does not go down to none."""
     spread = twin.noise.spread
     known = spread.intervals.get("tail_share")
     if spread.value.tail_share == 0.0 or (known is not None and known.low <= 0.0):
@@ -205,16 +187,11 @@ def findings_left(session: PreparedSession, explained: Mapping[str, Explained]) 
 
 
 def _spectral_point(
-    acquisition: AcquisitionFile,
-    twin: Twin,
-    *,
-    rng: np.random.Generator,
-    progress: Callable[[str], None] | None,
-) -> NDArray[np.float64] | None:
+    acquisition: AcquisitionFile, twin: Twin, *, rng: np.random.Generator, progress: Callable[[str], None] | None
+) -> FloatArray | None:
     """The twin's spectral parameters (parameter,) as the session's flats show them, each beam's later ones; None: it knows all beams.
 
-    A calibration from few beams leaves the spectrum wide, and what other beams show lies far along its nuisances: straight lines
-    from the calibrated point do not reach it, and an effect of the beam was named that made up for that.
+    What beams that did not calibrate show lies far along the spectrum's nuisances, where straight lines do not reach.
     """
     calibrating = calibrating_names(acquisition.series)
     flats = [

@@ -22,20 +22,15 @@ _ONE_RATE = 1.25  # largest over smallest level a unit of exposure that one unkn
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionSeries:
-    """One series and its request to the forward model; calibrates: dark and gain maps come from it.
-
-    own_noise: the flats that calibrate its beam are single frames, so that the twin has the noise from series like this one.
-    divided: its frames were divided by an open field measured elsewhere, so that their level says nothing.
-    shares: they are I/I0, or logarithms of it. ends_at_zero: its numbers go down to 0 and not below, so that noise may be cut off.
-    """
+    """One series and its request to the forward model."""
 
     series: Series
     request: SeriesRequest
-    calibrates: bool
-    own_noise: bool
-    divided: bool
-    shares: bool
-    ends_at_zero: bool
+    calibrates: bool  # dark and gain maps come from it
+    own_noise: bool  # single flats calibrate its beam: the twin has the noise from series like this one
+    divided: bool  # its frames were divided by an open field of another time: their level says nothing
+    shares: bool  # they are I/I0, or logarithms of it
+    ends_at_zero: bool  # its numbers go down to 0 and not below, so that noise may be cut off
 
     @property
     def name(self) -> str:
@@ -143,12 +138,9 @@ def read_session(
 ) -> tuple[SessionSeries, ...]:
     """The series of an acquisition in order of time, each with its request to the forward model.
 
-    Args:
-        acquisition: open file.
-        calibrated_elsewhere: the twin comes from another session and no series here is marked as calibrating: all were
-            taken after calibration.
-        exposed: series of the same session that tell nothing by themselves, but left charge in the panel where their load is known.
-        ends_at_zero: names of series whose numbers go down to 0 and not below.
+    calibrated_elsewhere: the twin comes from another session, and all series that are not marked as calibrating came after it;
+    exposed: further series, of which no more is known than what they left in the panel; ends_at_zero: names of series whose numbers
+    go down to 0 and not below.
 
     Raises:
         InputError: no series that the diagnosis can use.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ...calibration.frames.frame_checks import CopyScan, repeats_the_last
 from ...errors import InputError
 from ...generator.line.twin import LEAST_PIXELS
+from ..arrays import BoolArray, FloatArray, RealArray
 
 LAGS: tuple[tuple[int, int], ...] = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0))
 BLOCK_PX = 8  # side of the blocks whose means show slow texture
@@ -28,35 +29,25 @@ ROUNDED_SHARE = 0.37
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeriesSummary:
-    """Statistics of the n frames of one series; DN throughout.
+    """Statistics of the n frames of one series; DN throughout."""
 
-    Fields: frames, copies of the one before left out; mean_DN (row, column);
-    pair_variance_DN2, stack_variance_DN2 (row, column), common factor removed;
-    label_variance_DN2 (label,), label_autocovariance_DN2 (label, lag) over LAGS: averages over the pixels of each noise
-    label, of which there are label_pixels (label,), and over its label_pairs (label, lag) of neighbours;
-    row_variance_DN2, column_variance_DN2, block_variance_DN2: variance in time of the means of rows, columns and blocks
-    of BLOCK_PX; temporal_covariance_DN2 (2,): mean product of a pixel's deviations one and two frames apart;
-    kurtosis_excess of differences, pooled over standardised pixels; frame_mean_DN (n,); distinct_codes,
-    code_range: how many whole numbers occur between the 1st and 99th percentile, and how many there are from the first
-    to the last of them; unchanged_share (row, column): of a pixel's steps from frame to frame, those that change nothing.
-    """
-
-    frames: int
-    mean_DN: NDArray[np.float64]
-    pair_variance_DN2: NDArray[np.float64]
-    stack_variance_DN2: NDArray[np.float64]
-    label_variance_DN2: NDArray[np.float64]
-    label_autocovariance_DN2: NDArray[np.float64]
-    label_pixels: NDArray[np.int64]
-    label_pairs: NDArray[np.int64]
-    row_variance_DN2: float
-    column_variance_DN2: float
-    block_variance_DN2: float
-    temporal_covariance_DN2: NDArray[np.float64]
-    kurtosis_excess: float
-    frame_mean_DN: NDArray[np.float64]
-    distinct_codes: int
-    code_range: int
+    frames: int  # copies of the one before left out
+    mean_DN: FloatArray  # (row, column)
+    pair_variance_DN2: FloatArray  # (row, column), common factor removed
+    stack_variance_DN2: FloatArray  # (row, column), alike
+    label_variance_DN2: FloatArray  # (label,): average over the pixels of each noise label
+    label_autocovariance_DN2: FloatArray  # (label, lag) over LAGS, alike
+    label_pixels: NDArray[np.int64]  # (label,)
+    label_pairs: NDArray[np.int64]  # (label, lag): of neighbours
+    row_variance_DN2: float  # in time, of the means of rows
+    column_variance_DN2: float  # and of columns
+    block_variance_DN2: float  # and of blocks of BLOCK_PX
+    temporal_covariance_DN2: FloatArray  # (2,): mean product of a pixel's deviations one and two frames apart
+    kurtosis_excess: float  # of differences, pooled over standardised pixels
+    frame_mean_DN: FloatArray  # (n,)
+    distinct_codes: int  # whole numbers that occur between the 1st and 99th percentile
+    code_range: int  # whole numbers from the first to the last of them
+    # (row, column): of a pixel's steps from frame to frame, those that change nothing
     unchanged_share: NDArray[np.float32]
 
     def without_lines(self, rows_DN2: float, columns_DN2: float) -> "SeriesSummary":
@@ -79,30 +70,22 @@ class SeriesSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FirstLook:
-    """What says which pixels and series can be used.
-
-    Fields: as those of `SeriesSummary`; copies: frames that equal an earlier one; saturated_share: of the numbers of good pixels.
-    """
+    """What says which pixels and series can be used; others are as in `SeriesSummary`."""
 
     frames: int
-    copies: int
-    mean_DN: NDArray[np.float64]
-    pair_variance_DN2: NDArray[np.float64]
-    stack_variance_DN2: NDArray[np.float64]
+    copies: int  # frames that equal an earlier one
+    mean_DN: FloatArray
+    pair_variance_DN2: FloatArray
+    stack_variance_DN2: FloatArray
     unchanged_share: NDArray[np.float32]
-    saturated_share: float
+    saturated_share: float  # of the numbers of good pixels
 
 
 _Piece = tuple[NDArray[Any], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 
-def _pieces(
-    pieces: Iterable[NDArray[Any]], good: NDArray[np.bool_], pattern: NDArray[np.floating[Any]] | None, name: str
-) -> Iterator[_Piece]:
-    """Frames as they are, in single precision, less the first one and their common factor, and steps between these.
-
-    Copies of the frame before are left out: they say nothing more.
-    """
+def _pieces(pieces: Iterable[NDArray[Any]], good: BoolArray, pattern: RealArray | None, name: str) -> Iterator[_Piece]:
+    """Frames, none a copy of the one before, in single precision, less the first one and their common factor, and steps of these."""
     use = good.astype(np.float32)
     n_good = int(good.sum())
     if n_good < LEAST_PIXELS:
@@ -160,7 +143,7 @@ class _Variances:
         return squares
 
     @property
-    def mean(self) -> NDArray[np.float64]:
+    def mean(self) -> FloatArray:
         return np.asarray(self._total / self.frames)
 
     @property
@@ -168,11 +151,11 @@ class _Variances:
         return (self._unchanged / max(self.n_steps, 1)).astype(np.float32)
 
     @property
-    def of_pairs(self) -> NDArray[np.float64]:
+    def of_pairs(self) -> FloatArray:
         return self._steps / (2 * self.n_steps) if self.n_steps else np.full(self._steps.shape, np.nan)
 
     @property
-    def of_stack(self) -> NDArray[np.float64]:
+    def of_stack(self) -> FloatArray:
         if self.frames < 2:
             return np.full(self._sum.shape, np.nan)
         return np.clip(self._square - self._sum**2 / self.frames, 0.0, None) / (self.frames - 1)
@@ -181,8 +164,8 @@ class _Variances:
 def look_at_series(
     pieces: Iterable[NDArray[Any]],
     *,
-    good: NDArray[np.bool_],
-    pattern: NDArray[np.floating[Any]] | None = None,
+    good: BoolArray,
+    pattern: RealArray | None = None,
     name: str = "frames",
     saturation_DN: float | None = None,
 ) -> FirstLook:
@@ -213,42 +196,29 @@ def look_at_series(
 def summarise_series(
     pieces: Iterable[NDArray[Any]],
     *,
-    good: NDArray[np.bool_],
+    good: BoolArray,
     labels: NDArray[np.integer[Any]],
-    pattern: NDArray[np.floating[Any]] | None = None,
+    pattern: RealArray | None = None,
     name: str = "frames",
 ) -> SeriesSummary:
     """Statistics of a series, from pieces (m, row, column) in time order, DN.
 
     Args:
-        pieces: frames in time order.
-        good: pixels to use (row, column).
-        labels: noise label of each pixel (row, column), -1 for none; labels count from 0.
-        pattern: how one unit of the common factor looks (row, column), mean 1 over good pixels: the signal's shape with
-            the beam on, None (1 everywhere) without.
-        name: for errors.
+        pieces, name: frames, and what errors call them.
+        good, labels: pixels to use, and their noise labels from 0, -1 for none (row, column).
+        pattern: how one unit of the common factor looks (row, column), mean 1 over good pixels; None: 1 everywhere.
 
     Raises:
         InputError: no frames, frames of another shape than `good`, or values that are not finite.
     """
-    shape = good.shape
+    shape, n_good = good.shape, int(good.sum())
     use = good.astype(np.float32)
-    n_good = int(good.sum())
-    n_labels = max(int(labels.max()) + 1, 1)
-    flat_labels = np.where(good, labels, -1)
-    masks = [flat_labels == label for label in range(n_labels)]
-    pairs_of_lag = []
-    for dr, dc in LAGS:
-        first, second = _shifted(shape, dr, dc)
-        pairs_of_lag.append((first, second, [mask[first] & (mask[second]) for mask in masks]))
-
-    variances = _Variances(shape)
-    pair_fourth = 0.0
-    pair_second = 0.0
-    label_covariance = np.zeros((n_labels, len(LAGS)))
-    row_sum = column_sum = block_sum = 0.0
-    temporal = np.zeros(2)
-    temporal_pairs = np.zeros(2)
+    masks = [good & (labels == label) for label in range(max(int(labels.max()) + 1, 1))]
+    shifted = [_shifted(shape, dr, dc) for dr, dc in LAGS]
+    pairs_of_lag = [(first, second, [mask[first] & mask[second] for mask in masks]) for first, second in shifted]
+    variances, label_covariance = _Variances(shape), np.zeros((len(masks), len(LAGS)))
+    pair_fourth = pair_second = row_sum = column_sum = block_sum = 0.0
+    temporal, temporal_pairs = np.zeros(2), np.zeros(2)
     frame_means = []
     blocks = in_blocks(good).sum(axis=(1, 3), dtype=np.float32)
     row_count = np.maximum(use.sum(axis=1), 1.0)
@@ -259,8 +229,7 @@ def summarise_series(
         if raw.dtype.kind in "ui" and coded < CODES_FRAMES:
             code_parts.append(raw[: CODES_FRAMES - coded][:, good].ravel())
             coded += min(len(raw), CODES_FRAMES - coded)
-        means = np.tensordot(x, use, axes=2).astype(np.float64) / n_good
-        frame_means.append(means)
+        frame_means.append(np.tensordot(x, use, axes=2).astype(np.float64) / n_good)
         d2 = variances.add(raw, x, cleaned, d)
         if len(d):
             if len(d) > 3:
@@ -278,30 +247,27 @@ def summarise_series(
             block_sum += float(np.mean(block**2)) / 2.0 * len(d) if block.size else 0.0
         if len(x) > 3:
             centred = cleaned - cleaned.mean(axis=0)
+            # a stack's own mean takes a share of the variance out of each product
+            share = float(np.sum(centred * centred)) / n_good / (len(x) - 1)
             for step in (1, 2):
                 temporal[step - 1] += float(np.sum(centred[:-step] * centred[step:])) / n_good
                 temporal_pairs[step - 1] += len(x) - step
-                # a stack's own mean takes a share of the variance out of each product
-                share = float(np.sum(centred * centred)) / n_good / max(len(x) - 1, 1)
                 temporal[step - 1] += share * (len(x) - step) / len(x)
-    frames, n_pairs, pair_variance = variances.frames, variances.n_steps, variances.of_pairs
-    counts = np.array([mask.sum() for mask in masks])
+    n_pairs, pair_variance = variances.n_steps, variances.of_pairs
     of_labels = np.array([pair_variance[mask].mean() if mask.any() else np.nan for mask in masks])
-    pixel_pairs = np.array([[selected[label].sum() for _, _, selected in pairs_of_lag] for label in range(n_labels)])
+    pixel_pairs = np.array([[selected[label].sum() for _, _, selected in pairs_of_lag] for label in range(len(masks))])
     with np.errstate(invalid="ignore", divide="ignore"):
         covariance = label_covariance / max(n_pairs, 1) / pixel_pairs
-    distinct = span = 0
-    if code_parts:
-        distinct, span = _codes(np.concatenate(code_parts))
+    distinct, span = _codes(np.concatenate(code_parts)) if code_parts else (0, 0)
     one = max(n_pairs, 1)
     return SeriesSummary(
-        frames=frames,
+        frames=variances.frames,
         mean_DN=variances.mean,
         pair_variance_DN2=pair_variance,
         stack_variance_DN2=variances.of_stack,
         label_variance_DN2=of_labels,
         label_autocovariance_DN2=covariance,
-        label_pixels=counts,
+        label_pixels=np.array([mask.sum() for mask in masks]),
         label_pairs=pixel_pairs,
         row_variance_DN2=row_sum / one,
         column_variance_DN2=column_sum / one,
@@ -322,7 +288,7 @@ def _codes(values: NDArray[np.integer[Any]]) -> tuple[int, int]:
     return there.size, int(there[-1]) - int(there[0]) + 1
 
 
-def rounded_away(seen: SeriesSummary | FirstLook, good: NDArray[np.bool_]) -> bool:
+def rounded_away(seen: SeriesSummary | FirstLook, good: BoolArray) -> bool:
     """Whether most of what the noise of the good pixels (row, column) would do is lost in the steps of the ADC."""
     return float(np.mean(seen.unchanged_share[good])) > ROUNDED_SHARE
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ...acquisition.acquisition_io import AcquisitionFile
 from ...generator.frames.line_model import ExpectedSeries
+from ..arrays import BoolArray, FloatArray, RealArray
 from .even_maps import full_size, local_range, signal_map
 from .session import SessionSeries
 from .summaries import LEAST_NOISE_DN2, FirstLook, SeriesSummary, look_at_series, summarise_series
@@ -19,17 +20,13 @@ _MOST_SATURATED = 1e-3  # share of the pixels
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeenSeries:
-    """A series that can be compared, and what a first pass over its frames shows.
-
-    Fields: session; expected: by the base twin; look; readable (row, column): pixels whose noise is not cut off at 0; labels (row,
-    column): noise label of each pixel, -1: none; label_names.
-    """
+    """A series that can be compared, and what a first pass over its frames shows."""
 
     session: SessionSeries
-    expected: ExpectedSeries
+    expected: ExpectedSeries  # by the base twin
     look: FirstLook
-    readable: NDArray[np.bool_]
-    labels: NDArray[np.int64]
+    readable: BoolArray  # (row, column): pixels whose noise is not cut off at 0
+    labels: NDArray[np.int64]  # (row, column): noise label of each pixel, -1: none
     label_names: tuple[str, ...]
 
     @property
@@ -58,15 +55,9 @@ def stated_series(
     session: Sequence[SessionSeries], acquisition: AcquisitionFile
 ) -> tuple[list[SessionSeries], list[str]]:
     """Series that say what the model must know, and why each of the others cannot be used."""
-    usable: list[SessionSeries] = []
-    skipped: list[str] = []
-    for item in session:
-        reason = _why_not(item, acquisition)
-        if reason:
-            skipped.append(f"{item.name}: {reason}")
-        else:
-            usable.append(item)
-    return usable, skipped
+    reasons = {item.name: _why_not(item, acquisition) for item in session}
+    skipped = [f"{name}: {reason}" for name, reason in reasons.items() if reason]
+    return [item for item in session if not reasons[item.name]], skipped
 
 
 def _why_not(item: SessionSeries, acquisition: AcquisitionFile) -> str:
@@ -89,22 +80,16 @@ def look_at_all(
     items: Sequence[SessionSeries],
     expected: Mapping[str, ExpectedSeries],
     *,
-    good: NDArray[np.bool_],
+    good: BoolArray,
     bits: int | None,
-    dark_at: Callable[[float | None], NDArray[np.floating]],
+    dark_at: Callable[[float | None], RealArray],
     side: int,
     tell: Callable[[str], None],
 ) -> tuple[list[SeenSeries], list[str]]:
     """First pass over the frames; and why series are left out: saturated ones, and those that are nearly all cut off at 0.
 
-    Args:
-        items: series to look at.
-        expected: by the base twin, by name.
-        good: pixels in use (row, column).
-        bits: of the ADC; None: unknown.
-        dark_at: dark (row, column) of an exposure time, ms.
-        side: of the squares of the panel's pixels that stand for pixels.
-        tell: called with the name of each stage.
+    expected: by name; good: pixels in use (row, column); bits: of the ADC, None: unknown; dark_at: dark (row, column) of an exposure
+    time, ms; side: of the squares of the panel's pixels that stand for pixels.
     """
     saturation_DN = None if bits is None else 2.0**bits - 1
     seen: list[SeenSeries] = []
@@ -137,7 +122,7 @@ def look_at_all(
 
 
 def summarise_all(
-    seen: Sequence[SeenSeries], clean: NDArray[np.bool_], *, tell: Callable[[str], None]
+    seen: Sequence[SeenSeries], clean: BoolArray, *, tell: Callable[[str], None]
 ) -> dict[str, SeriesSummary]:
     """What the frames' noise says in pixels that do not stand out (`clean`, (row, column)), by name of series."""
     summaries: dict[str, SeriesSummary] = {}
@@ -157,11 +142,11 @@ def summarise_all(
 def _above_noise(
     item: SessionSeries,
     expected: ExpectedSeries,
-    signal_DN: NDArray[np.float64],
+    signal_DN: FloatArray,
     *,
-    dark_at: Callable[[float | None], NDArray[np.floating]],
+    dark_at: Callable[[float | None], RealArray],
     side: int,
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Pixels (row, column) whose numbers lie so far above 0 that no noise was cut off there."""
     subtracted = item.shares or "offset" in item.series.corrected
     number_DN = signal_DN if subtracted else signal_DN + dark_at(item.series.exposure_ms)
@@ -173,15 +158,13 @@ def _above_noise(
     return np.asarray(number_DN > _ABOVE_NOISE * one_DN)
 
 
-def _pattern(item: SessionSeries, signal: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+def _pattern(item: SessionSeries, signal: FloatArray, usable: BoolArray) -> FloatArray | None:
     """How one unit of a frame's common factor looks."""
     mean = float(signal[usable].mean()) if item.request.beam_on and usable.any() else 0.0
     return signal / mean if mean > 0 else None
 
 
-def _labels(
-    signal: NDArray[np.float64], kind: str, good: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+def _labels(signal: FloatArray, kind: str, good: BoolArray) -> tuple[NDArray[np.int64], tuple[str, ...]]:
     """Noise labels: the whole field, or quartiles of signal away from edges."""
     if kind != "object":
         return np.where(good, 0, -1).astype(np.int64), ("field",)

@@ -338,7 +338,7 @@ def changed_gain_pattern(
     if item.calibrates or not item.request.beam_on:
         return smooth, rest
     smooth[:maps] = probes.projection.apply(waves * signal.astype(np.float32)).T
-    own = 0.01 * math.sqrt(1.0 - scales.PATTERN_SMOOTH_SHARE) * signal
+    own = 0.01 * scales.PATTERN_FINE * signal
     for pattern, variance in rest.items():
         if pattern.of_columns:
             variance[:maps] = probes.projection.column_noise(own)
@@ -376,8 +376,8 @@ def _pattern_waves(shape: tuple[int, ...]) -> NDArray[np.float32]:
     weights = [1.0 / max(math.hypot(*numbers), 1.0) for numbers in waves]
     result = np.empty((len(waves), *shape), np.float32)
     for image, weight, wave in zip(result, weights, waves.values(), strict=True):
-        share = scales.PATTERN_SMOOTH_SHARE * weight / sum(weights)
-        image[...] = 0.01 * math.sqrt(share / float(np.mean(wave**2))) * wave
+        share = weight / sum(weights)
+        image[...] = 0.01 * scales.PATTERN_SMOOTH * math.sqrt(share / float(np.mean(wave**2))) * wave
     return result
 
 
@@ -388,15 +388,17 @@ def _waves(shape: tuple[int, ...], count: int) -> dict[tuple[int, int], FloatArr
     return {(i, k): np.outer(y[i], x[k]) for i in range(count) for k in range(count) if i or k}
 
 
-def uneven(probes: SeriesProbes, images: Mapping[int, Map], shape: tuple[int, ...]) -> dict[int, FloatArray]:
+def uneven(
+    probes: SeriesProbes, images: Mapping[int, Map], shape: tuple[int, ...], *, order: int
+) -> dict[int, FloatArray]:
     """Responses (smooth shape, probe), not shrunk, to more of a change in one part of the panel than in another, by key.
 
     A panel seldom warms evenly, and no anode's heel is a straight line. images: what changes do to the mean frame (row, column
-    or 1, 1), DN; shape: of the panel, rows and columns.
+    or 1, 1), DN; shape: of the panel, rows and columns; order: the highest of the shapes, 1 for slopes from side to side.
     """
     if not images:
         return {}
-    shapes = np.stack([one / order for order, one in _smooth(shape, scales.SHAPE_ORDER)]).astype(np.float32)
+    shapes = np.stack([one / number for number, one in _smooth(shape, order)]).astype(np.float32)
     uneven_ones = [key for key, image in images.items() if image.size > 1]
     # all at once: the projection is larger than a processor's cache
     under = [shapes, *(images[key] * shapes for key in uneven_ones)]

@@ -31,6 +31,11 @@ from .other_scenes import OtherScenes
 from .output_course import OutputCourse
 from .series_probes import MeanFrame, SeriesProbes
 
+UNEVEN_ORDER = {
+    "sides": 1,
+    "places": scales.SHAPE_ORDER,
+}  # of the smooth shapes in which an effect is uneven, by what is random
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeriesView:
@@ -91,8 +96,10 @@ def series_block(
     random = [EFFECTS[label].variation.random if label in EFFECTS else "" for label in labels]
     patterns = dict.fromkeys(_pattern_of(_values_of(asked[at])) for at, kind in enumerate(random) if kind == "pixels")
     pattern, jitter = changed_gain_pattern(probes, signal, patterns)
-    sides = {at: found[0] for at, found in enumerate(moved) if found is not None and random[at] == "sides"}
-    by_side = uneven(probes, sides, signal.shape)
+    by_place: dict[int, FloatArray] = {}
+    for kind, order in UNEVEN_ORDER.items():
+        images = {at: found[0] for at, found in enumerate(moved) if found is not None and random[at] == kind}
+        by_place |= uneven(probes, images, signal.shape, order=order)
     tiles = {
         number: changed_tiles(probes, signal, TilePattern.of(_values_of(item), rms=0.01)) * shrink[:, None]
         for number, item in enumerate(asked)
@@ -121,7 +128,7 @@ def series_block(
         pattern_jitter={one: variance * shrink**2 for one, variance in jitter.items()},
         lines=lines,
         lit_lines=lines * (0.01 * context.reference_signal_DN if context.kind in ("flat", "object") else 0.0) ** 2,
-        uneven={number: columns * shrink for number, columns in by_side.items()},
+        uneven={number: columns * shrink for number, columns in by_place.items()},
         tiles=tiles,
     )
 
@@ -144,13 +151,13 @@ def by_chance(variant: Variant, blocks: Sequence[SeriesBlock], row: int, readout
     a part of a gain map's change is smooth; bits that are cut off lower every level. row: number of the variant's first change.
     """
     random = EFFECTS[variant.effect].variation.random
-    if random == "sides":
+    if random in UNEVEN_ORDER:
         shapes = next((len(block.uneven[row]) for block in blocks if row in block.uneven), 0)
-        sides = np.zeros((sum(map(len, blocks)), shapes))
+        found = np.zeros((sum(map(len, blocks)), shapes))
         for block, place in zip(blocks, places_of(blocks), strict=True):
             if row in block.uneven:
-                sides[place] = block.uneven[row].T
-        return sides * (scales.UNEVEN_SHARE / variant.strengths[0])
+                found[place] = block.uneven[row].T
+        return found * (scales.UNEVEN_SHARE / variant.strengths[0])
     if random == "offset" and variant.since == "calibration":
         # lost bits may be cut off or rounded away: half a step between the two
         return np.concatenate([block.offset for block in blocks])[:, None] * scales.CUT_OFF_SHARE

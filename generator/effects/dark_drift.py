@@ -95,7 +95,7 @@ DARK_DRIFT = Effect(
     either_onset=True,
     absorbed="nothing",
     grid=Grid(shares=(0.8,)),
-    variation=Variation(random="sides"),
+    variation=Variation(random="places"),
     reading=Reading(sd=0.0, last_dark=True),
     images=InImages(left_out="it depends on the time in a session"),
 )

@@ -30,6 +30,7 @@ ABSORBED = {
 RANDOM = {
     "nothing": "all of it follows from its parameters",
     "sides": "more of it on one side of the panel than on the other",
+    "places": "more of it in one place of the panel than in another",
     "surroundings": "what stands beyond the borders of the picture, from where it brings light in",
     "offset": "lost bits may be cut off or rounded away: half a step on every level",
     "pixels": "a pattern from pixel to pixel or from column to column, a part of it smooth",

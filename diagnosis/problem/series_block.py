@@ -31,10 +31,8 @@ from .other_scenes import OtherScenes
 from .output_course import OutputCourse
 from .series_probes import MeanFrame, SeriesProbes
 
-UNEVEN_ORDER = {
-    "sides": 1,
-    "places": scales.SHAPE_ORDER,
-}  # of the smooth shapes in which an effect is uneven, by what is random
+# of the smooth shapes in which an effect is uneven, by what is random about it
+UNEVEN_ORDER = {"sides": 1, "places": scales.SHAPE_ORDER}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -160,7 +160,8 @@ def _key_figures(result: Mapping[str, Any]) -> list[dict[str, str]]:
     figures.append(
         {
             "value": f"{gap['before']:.1f} → {gap['after']:.1f}",
-            "text": "gap between line and twin, before and after the diagnosis added what was missing (1: noise alone)",
+            "text": "gap between line and twin, before and after the diagnosis added what was missing "
+            f"(noise alone: {gap['floor']:.1f})",
         }
     )
     return figures

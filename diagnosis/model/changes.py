@@ -76,7 +76,7 @@ FEW_BAD_PIXELS, FEW_BAD_SHARE = 2, 2e-4  # pixels that turn bad in a session: tw
 # of level and gradient where frames were divided by an open field of another time: output, kV, filters and heel may differ
 DIVIDED_LEVEL_SD, DIVIDED_TILT_SD = 0.3, 0.1
 KURTOSIS_SD = 0.04  # of the excess kurtosis that all series have in common
-UNEVEN_SHARE = 0.3  # of an effect that may be uneven: how much more of it there may be on one side of the panel
+UNEVEN_SHARE = 0.3  # of an effect that may be uneven: how much more of it there may be in one part of the panel
 CUT_OFF_SHARE = 0.5  # of a step by which lost bits may lower a level
 PATTERN_WAVES = 8  # cosine waves along each side of a gain map's smooth change, the long ones the larger
 # standard deviations of what pixels change by themselves and of that smooth part, over the strength; of 0.7, 1.4 and 2.8 for the

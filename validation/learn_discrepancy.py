@@ -25,7 +25,7 @@ import second_simulator as plain
 
 from raytwin.acquisition import open_acquisition
 from raytwin.diagnosis.inference.curve_fits import CurveFit
-from raytwin.diagnosis.inference.discrepancy import LEVELS
+from raytwin.diagnosis.inference.discrepancy import LEVELS, log_frequency
 from raytwin.diagnosis.inference.inference import UNKNOWN, Misfits
 from raytwin.diagnosis.inference.unknown import LOG_DENSITY
 from raytwin.diagnosis.judgement.judgement import Weighed, verdict_of, weigh_problem
@@ -78,11 +78,21 @@ def told_by_law(weighed: Weighed, fit: CurveFit, *, another: bool = False) -> di
     another: the effect is only like the law's: it has any strength, and where it leaves a misfit the law is off by most.
     """
     by_level = fit.at_any_strength if another else fit.by_level
-    point = fit.at_level(LEVELS.levels[-1] if another else fit.level)
     misfits = Misfits(weighed.observed, weighed.problem.families)
-    evidence, found = misfits.in_presence_of([point])
-    evidence += misfits.prior([point], another=another)
-    return {"by_level": list(by_level), "with_misfit": evidence, "ratio": misfits.ratio([point], found)}
+    if another:
+        found = misfits.beside([replace(fit, level=LEVELS.levels[-1])])
+    else:
+        found = misfits.settled(misfits.beside([fit]), fit.log_evidence)
+    (point,) = (one.point for one in found.fits)
+    evidence, misfit = misfits.in_presence_of([point])
+    evidence += misfits.prior([point], misfit, another=another) - log_frequency(point.level, another=another)
+    level = LEVELS.levels.index(point.level)
+    return {
+        "by_level": list(by_level),
+        "with_misfit": evidence,
+        "level": level,
+        "ratio": misfits.ratio([point], misfit),
+    }
 
 
 def told(hypotheses) -> dict:
@@ -103,6 +113,7 @@ def frequencies(rows: list[dict], density: Callable[[list[float], list[float]], 
     known = [row for row in rows if max(*row["by_level"], row["with_misfit"]) > _CLEAR]
     by_level = np.array([row["by_level"] for row in known])
     with_misfit = np.array([row["with_misfit"] for row in known])
+    of_misfit = np.array([row["level"] for row in known])
     ratios = [max(row["ratio"], _SHORTEST) for row in known]
     levels, misfit, of_length = (
         np.full(len(LEVELS.levels), 1.0 / len(LEVELS.levels)),
@@ -114,13 +125,13 @@ def frequencies(rows: list[dict], density: Callable[[list[float], list[float]], 
         scores = np.concatenate(
             [
                 by_level + np.log(levels * (1.0 - misfit)),
-                (with_misfit + of_length - LOG_DENSITY + math.log(misfit))[:, None],
+                (with_misfit + of_length - LOG_DENSITY + np.log(misfit * levels[of_misfit]))[:, None],
             ],
             axis=1,
         )
         shares = np.exp(scores - np.logaddexp.reduce(scores, axis=1)[:, None])
         taken = shares[:, :-1].sum(axis=0)
-        np.add.at(taken, np.argmax(by_level, axis=1), shares[:, -1])
+        np.add.at(taken, of_misfit, shares[:, -1])
         levels = np.maximum(taken / taken.sum(), _NONE)
         levels /= levels.sum()
         misfit = min(max(float(shares[:, -1].mean()), _NONE), 1.0 - _NONE)

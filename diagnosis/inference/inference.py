@@ -20,9 +20,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ...generator.effects import EFFECTS
+from ..arrays import FloatArray
 from ..model.curves import Curve
-from .curve_fits import IN_FULL, CurveFit, interval_of, log_mean_exp
-from .discrepancy import LEVELS, at_most_off, log_frequency, log_misfit
+from .curve_fits import IN_FULL, CurveFit, fit_curve, interval_of, log_mean_exp
+from .discrepancy import FARTHEST_LEVEL, LEVELS, at_most_off, log_frequency, log_misfit
 from .observed import Observed, Point
 from .pairs import Single, log_odds_of_leak, log_odds_of_leak_in, log_prior, may_leave, weigh_pairs
 from .unknown import LOG_DENSITY, ExtraVariance, Families, fit_extra_variance
@@ -31,6 +32,7 @@ UNKNOWN = "unknown_effect"
 _NEAR = 10.0  # of log evidence: what lies so near to the likeliest, odds of 22,000, is looked at as that is
 # the likeliest effects that are the first of a pair at least: with six the same are named (notebook, ablation)
 _PAIRS_FROM = 2
+_TURNS, _SETTLED = 6, 0.1  # in which laws and their misfit settle, and gain of log evidence that ends them
 
 
 def title_of(effect: str) -> str:
@@ -53,6 +55,7 @@ class Hypothesis:
     levels: Mapping[str, float] = field(default_factory=dict)  # of discrepancy, by effect
     location: str = ""  # probe group of an unknown effect
     misfit: str = ""  # the family in which laws leave most; empty: they leave nothing
+    misfit_variance: FloatArray | None = None  # (probe,) of what they leave; None: nothing
 
     @property
     def of_catalogue(self) -> bool:
@@ -133,17 +136,18 @@ def _weighed(
     nothing = left.no_effect(misfits)
     weighed = [(nothing, math.log(priors.none))]
     of_single = math.log(priors.single / count)
-    alike, like_two, whole = [], [], {}
+    alike, like_two, whole = [], [], dict[str, _Settled]()
     for effect in ranked:
         single = singles[effect]
         found = _of_fits((effect,), {effect: single.best}, single.log_evidence)
         found = replace(found, strengths={effect: interval_of(single.fits)})
+        own = _Settled(found, {effect: single.best}, observed)
         if misfits and effect in {*ranked[:IN_FULL], *near}:
-            found = left.of_kind(found, [single.best])[0]
-            alike.append(left.of_another(single))
-        weighed.append((found, of_single))
-        whole[effect] = found
-    of_given = _left_by_given(observed, singles, whole)
+            own, another = left.of_kind(own)
+            alike.append(left.of_another(single, another))
+        weighed.append((own.hypothesis, of_single))
+        whole[effect] = own
+    of_given = _left_by_given(observed, whole)
     if of_given is not None:
         weighed.append((replace(nothing, log_evidence=of_given), math.log(priors.none)))
     leaks: dict[str, Hypothesis] = {}
@@ -151,20 +155,22 @@ def _weighed(
     pairs = weigh_pairs(observed, singles, leading=max(_PAIRS_FROM, len(near)), beside=beside)
     least = max((pair.log_evidence for pair in pairs), default=0.0) - _NEAR
     for number, pair in enumerate(pairs):
-        found = _of_fits(pair.effects, pair.fits, pair.log_evidence)
+        own = _Settled(_of_fits(pair.effects, pair.fits, pair.log_evidence), pair.fits, observed)
         if misfits and (number < IN_FULL or pair.log_evidence > least):
-            found, another = left.of_kind(found, list(pair.fits.values()))
-            like_two.append(another)
+            own, another = left.of_kind(own)
+            like_two.append(another.log_evidence)
+        found = own.hypothesis
         weighed.append((found, of_pair))
         # or the weaker of them is what the stronger one's law leaves; not one that the twin has, which would have to be there
-        strong, leaves = log_odds_of_leak(observed, pair)
+        strong, leaves = log_odds_of_leak(own.observed, replace(pair, fits=own.fits))
         if any(observed.has(effect) for effect in pair.effects if effect != strong):
             continue
         # as it is once that is taken off; what is left of it beyond doubt is a misfit
-        alone = _of_fits((strong,), {strong: pair.fits[strong]}, found.log_evidence + leaves)
-        (weak,) = (fit for effect, fit in pair.fits.items() if effect != strong)
+        alone = _of_fits((strong,), {strong: own.fits[strong]}, found.log_evidence + leaves)
+        (weak,) = (fit for effect, fit in own.fits.items() if effect != strong)
         shows = pair.log_evidence > singles[strong].log_evidence + _NEAR
-        alone = replace(alone, misfit=found.misfit or (_place_of(weak, families) if shows else ""))
+        place = found.misfit or (_place_of(weak, families) if shows else "")
+        alone = replace(alone, misfit=place, misfit_variance=found.misfit_variance)
         if alone.log_evidence > leaks.get(strong, singles[strong]).log_evidence:
             leaks[strong] = alone
     weighed += [(item, of_single) for item in leaks.values()]
@@ -177,20 +183,19 @@ def _weighed(
     return weighed
 
 
-def _left_by_given(
-    observed: Observed, singles: Mapping[str, Single], weighed: Mapping[str, Hypothesis]
-) -> float | None:
+def _left_by_given(observed: Observed, weighed: Mapping[str, "_Settled"]) -> float | None:
     """Log evidence over none of what laws of the twin's own effects leave in the shape of another; None: the twin has none."""
     given = [point.effect for point in observed.given]
-    others = [one for one in singles if one not in given and any(may_leave(effect, one) for effect in given)]
+    others = [one for one in weighed if one not in given and any(may_leave(effect, one) for effect in given)]
     if not others:
         return None
-    acting = observed.acting(observed.given)
     levels = [(1.0, at_most_off(observed.given[0].level))]
-    return max(
-        weighed[effect].log_evidence + log_odds_of_leak_in(observed, singles[effect].best, acting, levels)
-        for effect in others
-    )
+
+    def evidence(own: _Settled, fit: CurveFit) -> float:
+        acting = own.observed.acting(observed.given)
+        return own.hypothesis.log_evidence + log_odds_of_leak_in(own.observed, fit, acting, levels)
+
+    return max(evidence(weighed[effect], weighed[effect].fits[effect]) for effect in others)
 
 
 def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis, ...]:
@@ -208,6 +213,15 @@ def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis
     return tuple(sorted(every, key=lambda item: (-item.probability, -item.log_evidence)))
 
 
+@dataclass(frozen=True, slots=True)
+class _Settled:
+    """A hypothesis, the fits of its effects where it is likeliest, and what they are fitted to: less sharp where there is a misfit."""
+
+    hypothesis: Hypothesis
+    fits: Mapping[str, CurveFit]  # by effect
+    observed: Observed
+
+
 class Misfits:
     """What laws leave beside effects, in families of probes."""
 
@@ -221,32 +235,61 @@ class Misfits:
         plain = Hypothesis(effects=(), probability=0.0, log_evidence=0.0)
         if not (misfits and self._observed.given):
             return plain
-        given = [point.effect for point in self._observed.given]
-        found = fit_extra_variance(self._observed.conditioned(), self._families, left_by=given)
-        return self._weighed(plain, [], found.log_evidence, found)
+        return _either(plain, self.beside([]))
 
-    def of_kind(self, hypothesis: Hypothesis, fits: Sequence[CurveFit]) -> tuple[Hypothesis, float]:
-        """A hypothesis whose laws may leave a misfit, and log evidence over none of what is only like its effects.
+    def of_kind(self, weighed: "_Settled") -> tuple["_Settled", "OnlyLike"]:
+        """A hypothesis whose laws may leave a misfit, from one without, and what is only like its effects."""
+        first = self.beside(list(weighed.fits.values()))
+        plain = weighed.hypothesis.log_evidence
+        found = self.settled(first, plain)
+        another = OnlyLike(plain=first.plain_of_another, with_misfit=max(first.of_another, found.of_another))
+        hypothesis = _either(weighed.hypothesis, found)
+        if not _shows(found, plain):
+            return replace(weighed, hypothesis=hypothesis), another
+        fits = {fit.curve.effect: fit for fit in found.fits}
+        return _Settled(hypothesis, fits, self._observed.with_own_variance(found.misfit.variance)), another
 
-        fits: of its effects, whose curves are in the first units.
+    def settled(self, found: "BesideMisfit", plain: float) -> "BesideMisfit":
+        """Effects and their misfit, each brought to what the other leaves of the probes, in turn: beside a misfit a law may be nearer.
+
+        plain: log evidence without a misfit; one that is less likely than none is left as it is.
         """
+        for _ in range(_TURNS):
+            if not _shows(found, plain):
+                break
+            turn = self.beside(self._fitted_beside(found))
+            if turn.log_evidence < found.log_evidence + _SETTLED:
+                break
+            found = turn
+        return found
+
+    def beside(self, fits: Sequence[CurveFit]) -> "BesideMisfit":
+        """Effects at the points of their fits, with a misfit."""
         points = [fit.point for fit in fits]
         evidence, found = self.in_presence_of(points)
-        another = evidence + self.prior(points, another=True)
-        whole = self._weighed(hypothesis, points, evidence + self.prior(points), found)
-        return whole, self._like(points, another - found.log_evidence, another, found)
-
-    def _weighed(
-        self, hypothesis: Hypothesis, points: Sequence[Point], evidence: float, found: ExtraVariance
-    ) -> Hypothesis:
-        """A hypothesis with log evidence `evidence` where there is a misfit `found`, and without."""
-        plain = hypothesis.log_evidence + math.log1p(-LEVELS.misfit_of_kind)
-        with_misfit = evidence + math.log(LEVELS.misfit_of_kind) + log_misfit(self.ratio(points, found)) - LOG_DENSITY
-        return replace(
-            hypothesis,
-            log_evidence=float(np.logaddexp(plain, with_misfit)),
-            misfit=found.place if with_misfit > plain else "",
+        ratio = self.ratio(points, found)
+        of_kind = evidence + self.prior(points, found) + log_misfit(ratio)
+        of_another = evidence + self.prior(points, found, another=True) + log_misfit(ratio, another=True)
+        return BesideMisfit(
+            fits=tuple(fits),
+            log_evidence=of_kind - LOG_DENSITY,
+            of_another=of_another - LOG_DENSITY,
+            plain_of_another=evidence - found.log_evidence + self.prior(points, another=True),
+            misfit=found,
         )
+
+    def _fitted_beside(self, found: "BesideMisfit") -> list[CurveFit]:
+        """The effects fitted to what a misfit leaves of the probes, each beside the others."""
+        fits = list(found.fits)
+        observed = self._observed.conditioned(*(fit.curve.effect for fit in fits))
+        observed = observed.with_own_variance(found.misfit.variance)
+        for number, fit in enumerate(fits):
+            beside = observed
+            for other in fits:
+                beside = beside if other is fit else beside.in_presence_of(other.point)
+            levels = LEVELS if len(fits) == 1 else LEVELS.up_to(FARTHEST_LEVEL)
+            fits[number] = replace(fit_curve(beside, fit.curve, levels=levels), share=fit.share)
+        return fits
 
     def ratio(self, points: Sequence[Point], found: ExtraVariance) -> float:
         """Length of a misfit over that of what the laws beside it do, those of the twin's own effects among them."""
@@ -259,20 +302,13 @@ class Misfits:
         """Whether what is like an effect may have any strength: next to none of what the twin has is that effect gone."""
         return not self._observed.has(effect)
 
-    def of_another(self, single: Single) -> float:
-        """Log evidence over none of an effect that is only like one of the catalogue's."""
+    def of_another(self, single: Single, another: "OnlyLike") -> float:
+        """Log evidence over none of an effect that is only like one of the catalogue's: at all levels, with a misfit at two."""
         any_strength = self._any_strength(single.best.curve.effect)
         full = [fit for fit in single.fits if len(fit.by_level) > 1]
         plain = log_mean_exp([fit.of_another(any_strength=any_strength) for fit in full])
-        points = [single.best.at_level(LEVELS.levels[-1])]
-        evidence, found = self.in_presence_of(points)
-        return self._like(points, plain, evidence + self.prior(points, another=True), found)
-
-    def _like(self, points: Sequence[Point], plain: float, evidence: float, found: ExtraVariance) -> float:
-        """Log evidence of what is only like effects: `plain` without a misfit, `evidence` with the one that was found."""
-        evidence += log_misfit(self.ratio(points, found), another=True) - LOG_DENSITY
-        share = LEVELS.misfit_of_another
-        return float(np.logaddexp(plain + math.log1p(-share), evidence + math.log(share)))
+        farthest = self.beside([replace(single.best, level=LEVELS.levels[-1])])
+        return OnlyLike(plain=plain, with_misfit=max(another.with_misfit, farthest.of_another)).log_evidence
 
     def in_presence_of(self, points: Sequence[Point]) -> tuple[float, ExtraVariance]:
         """Log evidence over none, without priors, of effects at their points with a misfit beside them, and what that misfit is."""
@@ -285,9 +321,11 @@ class Misfits:
         evidence = self._observed.log_evidence_without(*effects) + beside.log_likelihood - alone.log_likelihood
         return evidence + found.log_evidence, found
 
-    def prior(self, points: Sequence[Point], *, another: bool = False) -> float:
-        """Log of what effects at their points take of the prior; another: of what is only like them."""
+    def prior(self, points: Sequence[Point], misfit: ExtraVariance | None = None, *, another: bool = False) -> float:
+        """Log of what effects at their points, beside a misfit, take of the prior; another: of what is only like them."""
         alone = self._observed.conditioned(*(point.effect for point in points))
+        if misfit is not None:
+            alone = alone.with_own_variance(misfit.variance)
         total = 0.0
         for point in points:
             others = alone
@@ -296,6 +334,58 @@ class Misfits:
             any_strength = another and self._any_strength(point.effect)
             total += log_prior(others, point, another=another, any_strength=any_strength)
         return total
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OnlyLike:
+    """Log evidence over none of what is only like effects of the catalogue: without a misfit, and with one."""
+
+    plain: float
+    with_misfit: float
+
+    @property
+    def log_evidence(self) -> float:
+        """Of both, as often as such a law leaves a misfit."""
+        share = LEVELS.misfit_of_another
+        return float(np.logaddexp(self.plain + math.log1p(-share), self.with_misfit + math.log(share)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BesideMisfit:
+    """Effects whose laws leave a misfit; log evidences are over none."""
+
+    fits: tuple[CurveFit, ...]  # one an effect
+    log_evidence: float
+    of_another: float  # of what is only like these effects
+    plain_of_another: float  # of that without a misfit
+    misfit: ExtraVariance
+
+
+def _of_kind(plain: float, found: BesideMisfit) -> tuple[float, float]:
+    """Log evidence of a law without a misfit and with the one that was found, as often as each occurs."""
+    share = LEVELS.misfit_of_kind
+    return plain + math.log1p(-share), found.log_evidence + math.log(share)
+
+
+def _shows(found: BesideMisfit, plain: float) -> bool:
+    """Whether a misfit is likelier than none."""
+    without, with_misfit = _of_kind(plain, found)
+    return with_misfit > without
+
+
+def _either(hypothesis: Hypothesis, found: BesideMisfit) -> Hypothesis:
+    """A hypothesis whose laws may leave a misfit: as it is without one, or with one, whichever is likelier."""
+    evidence = float(np.logaddexp(*_of_kind(hypothesis.log_evidence, found)))
+    if not _shows(found, hypothesis.log_evidence):
+        return replace(hypothesis, log_evidence=evidence)
+    return replace(
+        hypothesis,
+        log_evidence=evidence,
+        strengths={fit.curve.effect: interval_of([fit]) for fit in found.fits},
+        levels={fit.curve.effect: fit.level for fit in found.fits},
+        misfit=found.misfit.place,
+        misfit_variance=found.misfit.variance,
+    )
 
 
 def _place_of(fit: CurveFit, families: Families) -> str:

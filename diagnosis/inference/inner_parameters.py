@@ -38,6 +38,8 @@ def with_inner_open(
     strengths = dict(hypothesis.strengths)
     for effect, curve in opened.items():
         beside = observed.conditioned(*hypothesis.effects)
+        if hypothesis.misfit_variance is not None:
+            beside = beside.with_own_variance(hypothesis.misfit_variance)
         for other, its in opened.items():
             if other != effect:
                 beside = beside.in_presence_of(replace(hypothesis.point(other), curve=its))

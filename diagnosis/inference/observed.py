@@ -124,6 +124,17 @@ class Observed:
             root=self.units * root,
         )
 
+    def with_own_variance(self, variance: FloatArray) -> "Observed":
+        """The same residual where each probe varies by so much more (probe,), squares of standard deviations of the first probes."""
+        root = np.sqrt(1.0 + variance / self.units**2)
+        no_factor = np.zeros((len(root), 0))
+        return replace(
+            self,
+            residual=self.residual / root,
+            nuisances=self.nuisances.over(root, no_factor, csc_array((0, len(root)))),
+            root=self.units * root,
+        )
+
     def in_presence_of(self, point: Point) -> "Observed":
         """What is left once an effect stands there, its strength about as it says."""
         left, of_strength = self._less(point)

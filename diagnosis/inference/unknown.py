@@ -44,7 +44,12 @@ class ExtraVariance:
 
     log_evidence: float  # over none, of an unknown effect
     place: str  # family of probes in which it is seen most
-    length: float  # root of the sum of the extra variances of all probes, standard deviations of the first probes
+    variance: FloatArray  # (probe,), squares of standard deviations of the first probes
+
+    @property
+    def length(self) -> float:
+        """Root of the sum of the extra variances of all probes."""
+        return math.sqrt(float(np.sum(self.variance)))
 
 
 def fit_extra_variance(
@@ -61,7 +66,7 @@ def fit_extra_variance(
     reached = frozenset(range(len(members))) if left_by is None else families.reached_by(left_by)
     open_ones = [number for number, part in enumerate(members) if len(part) and number in reached]
     if not open_ones:
-        return ExtraVariance(log_evidence=-math.inf, place="", length=0.0)
+        return ExtraVariance(log_evidence=-math.inf, place="", variance=np.zeros(len(residual)))
     grams = np.stack([factors[part].T @ factors[part] for part in members])
     sums = np.stack([factors[part].T @ residual[part] for part in members])
     squares = np.array([float(np.sum(residual[part] ** 2)) for part in members])
@@ -102,11 +107,8 @@ def fit_extra_variance(
         place = int(np.unravel_index(int(np.argmax(own)), own.shape)[0])
     else:
         place = int(np.argmax(tau2 * sizes))
-    units = observed.units
-    length = math.sqrt(
-        sum(float(size) * float(np.sum(units[part] ** 2)) for size, part in zip(tau2, members, strict=True))
-    )
-    return ExtraVariance(log_evidence=best - base, place=families.names[place], length=length)
+    variance = tau2[families.of] * observed.units**2
+    return ExtraVariance(log_evidence=best - base, place=families.names[place], variance=variance)
 
 
 def _price(shown: int, count: int) -> float:

@@ -1053,6 +1053,21 @@ def test_a_law_that_leaves_a_rest_elsewhere_is_named_with_the_place_of_the_rest(
     assert found[0].misfit in {f"group {number}" for number in range(24, 30)}
 
 
+def test_a_law_that_leaves_a_rest_in_one_place_is_as_exact_as_it_is_in_all_others():
+    rng = np.random.default_rng(3)
+    law = 300.0 * rng.standard_normal(PROBES) / np.sqrt(PROBES)
+    rest = np.where(GROUPS == 7, 40.0 * rng.standard_normal(PROBES), 0.0)
+    one = in_nodes("a", [law, 10.0 * law], [1.0, 10.0], low=0.5, high=50.0)
+    residual = 4.0 * law + rest + rng.standard_normal(PROBES)
+    found = weigh(residual, np.zeros((PROBES, 1)), [one])[0]
+    (fit,) = fit_effects(seen(residual), [one])
+    # without the rest set apart the law itself would have to be off by more
+    assert fit.level > found.levels["a"]
+    value, low, high = found.strengths["a"]
+    assert found.effects == ("a",) and found.misfit == "group 7"
+    assert low < 4.0 < high and (high - low) / value < 0.05
+
+
 def test_one_family_that_is_off_by_a_little_is_no_effect_and_several_are_an_unknown_one(setup):
     rng, factors, chosen = setup
     residual = noise(rng, factors)

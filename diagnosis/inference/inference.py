@@ -25,7 +25,7 @@ from ..model.curves import Curve
 from .curve_fits import IN_FULL, CurveFit, fit_curve, interval_of, log_mean_exp
 from .discrepancy import FARTHEST_LEVEL, LEVELS, at_most_off, log_frequency, log_misfit
 from .observed import Observed, Point
-from .pairs import Single, log_odds_of_leak, log_odds_of_leak_in, log_prior, may_leave, weigh_pairs
+from .pairs import Pair, Single, log_odds_of_leak, log_odds_of_leak_in, log_prior, may_leave, weigh_pairs
 from .unknown import LOG_DENSITY, ExtraVariance, Families, fit_extra_variance
 
 UNKNOWN = "unknown_effect"
@@ -145,6 +145,8 @@ def _weighed(
         if misfits and effect in {*ranked[:IN_FULL], *near}:
             own, another = left.of_kind(own)
             alike.append(left.of_another(single, another))
+            if own.hypothesis.misfit:
+                own = own.of_variants(single.fits)
         weighed.append((own.hypothesis, of_single))
         whole[effect] = own
     of_given = _left_by_given(observed, whole)
@@ -159,20 +161,12 @@ def _weighed(
         if misfits and (number < IN_FULL or pair.log_evidence > least):
             own, another = left.of_kind(own)
             like_two.append(another.log_evidence)
-        found = own.hypothesis
-        weighed.append((found, of_pair))
-        # or the weaker of them is what the stronger one's law leaves; not one that the twin has, which would have to be there
-        strong, leaves = log_odds_of_leak(own.observed, replace(pair, fits=own.fits))
-        if any(observed.has(effect) for effect in pair.effects if effect != strong):
-            continue
-        # as it is once that is taken off; what is left of it beyond doubt is a misfit
-        alone = _of_fits((strong,), {strong: own.fits[strong]}, found.log_evidence + leaves)
-        (weak,) = (fit for effect, fit in own.fits.items() if effect != strong)
-        shows = pair.log_evidence > singles[strong].log_evidence + _NEAR
-        place = found.misfit or (_place_of(weak, families) if shows else "")
-        alone = replace(alone, misfit=place, misfit_variance=found.misfit_variance)
-        if alone.log_evidence > leaks.get(strong, singles[strong]).log_evidence:
-            leaks[strong] = alone
+        weighed.append((own.hypothesis, of_pair))
+        alone = _of_the_stronger(own, pair, singles, families)
+        if alone is not None:
+            (strong,) = alone.effects
+            if alone.log_evidence > leaks.get(strong, singles[strong]).log_evidence:
+                leaks[strong] = alone
     weighed += [(item, of_single) for item in leaks.values()]
     of_one = float(np.logaddexp.reduce(alike)) - math.log(count)
     of_two = float(np.logaddexp.reduce(like_two)) - math.log(max(count * (count - 1) // 2, 1))
@@ -183,6 +177,24 @@ def _weighed(
     return weighed
 
 
+def _of_the_stronger(
+    own: "_Settled", pair: Pair, singles: Mapping[str, Single], families: Families
+) -> Hypothesis | None:
+    """The stronger of two effects alone, the weaker one being what its law leaves; None: the twin has that one, so it is there."""
+    strong, leaves = log_odds_of_leak(own.observed, replace(pair, fits=own.fits))
+    ((weak, fit),) = ((effect, fit) for effect, fit in own.fits.items() if effect != strong)
+    if own.observed.has(weak):
+        return None
+    found = own.hypothesis
+    # as it is once that is subtracted; what is left of it beyond doubt is a misfit
+    shows = pair.log_evidence > singles[strong].log_evidence + _NEAR
+    return replace(
+        _of_fits((strong,), {strong: own.fits[strong]}, found.log_evidence + leaves),
+        misfit=found.misfit or (_place_of(fit, families) if shows else ""),
+        misfit_variance=found.misfit_variance,
+    )
+
+
 def _left_by_given(observed: Observed, weighed: Mapping[str, "_Settled"]) -> float | None:
     """Log evidence over none of what laws of the twin's own effects leave in the shape of another; None: the twin has none."""
     given = [point.effect for point in observed.given]
@@ -191,11 +203,12 @@ def _left_by_given(observed: Observed, weighed: Mapping[str, "_Settled"]) -> flo
         return None
     levels = [(1.0, at_most_off(observed.given[0].level))]
 
-    def evidence(own: _Settled, fit: CurveFit) -> float:
+    def evidence(effect: str) -> float:
+        own = weighed[effect]
         acting = own.observed.acting(observed.given)
-        return own.hypothesis.log_evidence + log_odds_of_leak_in(own.observed, fit, acting, levels)
+        return own.hypothesis.log_evidence + log_odds_of_leak_in(own.observed, own.fits[effect], acting, levels)
 
-    return max(evidence(weighed[effect], weighed[effect].fits[effect]) for effect in others)
+    return max(map(evidence, others))
 
 
 def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis, ...]:
@@ -215,11 +228,18 @@ def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis
 
 @dataclass(frozen=True, slots=True)
 class _Settled:
-    """A hypothesis, the fits of its effects where it is likeliest, and what they are fitted to: less sharp where there is a misfit."""
+    """A hypothesis, the fits of its effects where it is likeliest, and what they are fitted to: wider where there is a misfit."""
 
     hypothesis: Hypothesis
     fits: Mapping[str, CurveFit]  # by effect
     observed: Observed
+
+    def of_variants(self, fits: Sequence[CurveFit]) -> "_Settled":
+        """With the strength of its one effect as all variants that are weighed in full leave it open."""
+        (effect,) = self.fits
+        observed = self.observed.conditioned(effect)
+        again = [fit_curve(observed, fit.curve) for fit in fits if len(fit.by_level) > 1]
+        return replace(self, hypothesis=replace(self.hypothesis, strengths={effect: interval_of(again)}))
 
 
 class Misfits:
@@ -250,7 +270,7 @@ class Misfits:
         return _Settled(hypothesis, fits, self._observed.with_own_variance(found.misfit.variance)), another
 
     def settled(self, found: "BesideMisfit", plain: float) -> "BesideMisfit":
-        """Effects and their misfit, each brought to what the other leaves of the probes, in turn: beside a misfit a law may be nearer.
+        """Effects and their misfit, each brought to what the other leaves of the probes, in turn: beside one a law may be nearer.
 
         plain: log evidence without a misfit; one that is less likely than none is left as it is.
         """

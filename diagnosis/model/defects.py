@@ -125,12 +125,13 @@ def _largest_ratio(frames: int) -> float:
     return float(2.0 * gammainccinv(0.5 * freedom, 1e-7) / freedom)
 
 
-def lasting_anywhere(seen: Sequence[SeenSeries], good: BoolArray) -> BoolArray:
-    """Good pixels (row, column) whose level lasts for some frames in any later dark."""
+def lasting_anywhere(seen: Sequence[SeenSeries], good: BoolArray, *, counting: bool) -> BoolArray:
+    """Good pixels (row, column) whose level lasts for some frames in any later dark; one that stands at a step leaves it seldom."""
     found = np.zeros(good.shape, dtype=bool)
     for one in seen:
-        if one.session.series.kind == "dark" and not one.session.calibrates:
-            look = one.look
+        look = one.look
+        tells = counting or not rounded_away(look, good)
+        if one.session.series.kind == "dark" and not one.session.calibrates and tells:
             found |= lasting_pixels(
                 look.stack_variance_DN2, look.pair_variance_DN2, look.frames, good, least_DN2=LEAST_NOISE_DN2
             )

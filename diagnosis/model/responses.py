@@ -266,7 +266,15 @@ def session_model(
     session = SessionModel(model=model, maps=maps, series=(), signals_DN=signals_DN, lines_DN2=lines_DN2)
     lines = {one.name: _lines_of_noise(one.expected) for one in seen if one.session.calibrates}
     counting, copies = counting_series([one.session for one in seen]), counted_copies(seen)
-    darks = [one.session for one in seen if one.session.series.kind == "dark" and not one.session.calibrates]
+    counts = bool(model.base.instrument.counting)
+    # in numbers that stand still no pixel's level is followed
+    darks = [
+        one.session
+        for one in seen
+        if one.session.series.kind == "dark"
+        and not one.session.calibrates
+        and (counts or not rounded_away(summaries[one.name], clean))
+    ]
     series = []
     before: float | None = None
     for shown in seen:
@@ -278,7 +286,7 @@ def session_model(
             signal_DN=signals_DN[item.name],
             previous_DN=before,
             summary=summaries[item.name],
-            counting=bool(model.base.instrument.counting),
+            counting=counts,
             counts_all=item.name == counting,
             repeatable=copies[item.name][1] if item.name in copies else 0,
             later_darks=tuple(

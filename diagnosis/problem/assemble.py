@@ -190,8 +190,9 @@ def _measured(
         tell=tell,
     )
     maps = calibrated_maps(seen, twin=twin, good=known_good)
-    standing_out = new_outliers(seen, maps, counting=bool(model.base.instrument.counting))
-    lasting = lasting_anywhere(seen, maps.good)
+    counting = bool(model.base.instrument.counting)
+    standing_out = new_outliers(seen, maps, counting=counting)
+    lasting = lasting_anywhere(seen, maps.good, counting=counting)
     outlying = standing_out.bad & ~lasting
     clean = maps.good & ~standing_out.any & ~lasting
     # they count as outliers; what else is said of noise is said without them

@@ -35,7 +35,6 @@ from raytwin.diagnosis.session.preparation import prepare_session
 
 _ROUNDS = 300
 _CLEAR = 3.0  # log evidence from which something is said
-_NONE = 1e-3  # least frequency of a level: none is impossible
 _SHORTEST = 1e-3  # of a misfit over what laws do: shorter ones do not show
 
 
@@ -132,9 +131,9 @@ def frequencies(rows: list[dict], density: Callable[[list[float], list[float]], 
         shares = np.exp(scores - np.logaddexp.reduce(scores, axis=1)[:, None])
         taken = shares[:, :-1].sum(axis=0)
         np.add.at(taken, of_misfit, shares[:, -1])
-        levels = np.maximum(taken / taken.sum(), _NONE)
-        levels /= levels.sum()
-        misfit = min(max(float(shares[:, -1].mean()), _NONE), 1.0 - _NONE)
+        # Laplace's rule of succession: as if each had been seen once more, so that none is impossible and few sessions say little
+        levels = (taken + 1.0) / (taken.sum() + len(taken))
+        misfit = (float(shares[:, -1].sum()) + 1.0) / (len(known) + 2.0)
         fitted, of_length = density(ratios, list(shares[:, -1]))
     return {"levels": [round(float(one), 3) for one in levels], "misfit": round(misfit, 3), "length": fitted}
 

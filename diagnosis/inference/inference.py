@@ -181,7 +181,7 @@ def _of_the_stronger(
     own: "_Settled", pair: Pair, singles: Mapping[str, Single], families: Families
 ) -> Hypothesis | None:
     """The stronger of two effects alone, the weaker one being what its law leaves; None: the twin has that one, so it is there."""
-    strong, leaves = log_odds_of_leak(own.observed, replace(pair, fits=own.fits))
+    strong, leaves = log_odds_of_leak(own.observed, replace(pair, fits=own.fits), also_off=own.misfit_ratio)
     ((weak, fit),) = ((effect, fit) for effect, fit in own.fits.items() if effect != strong)
     if own.observed.has(weak):
         return None
@@ -233,6 +233,7 @@ class _Settled:
     hypothesis: Hypothesis
     fits: Mapping[str, CurveFit]  # by effect
     observed: Observed
+    misfit_ratio: float = 0.0  # length of the misfit over that of what the laws do
 
     def of_variants(self, fits: Sequence[CurveFit]) -> "_Settled":
         """With the strength of its one effect as all variants that are weighed in full leave it open."""
@@ -267,7 +268,10 @@ class Misfits:
         if not _shows(found, plain):
             return replace(weighed, hypothesis=hypothesis), another
         fits = {fit.curve.effect: fit for fit in found.fits}
-        return _Settled(hypothesis, fits, self._observed.with_own_variance(found.misfit.variance)), another
+        observed = self._observed.with_own_variance(found.misfit.variance)
+        return _Settled(
+            hypothesis, fits, observed, self.ratio([fit.point for fit in found.fits], found.misfit)
+        ), another
 
     def settled(self, found: "BesideMisfit", plain: float) -> "BesideMisfit":
         """Effects and their misfit, each brought to what the other leaves of the probes, in turn: beside one a law may be nearer.

@@ -184,8 +184,10 @@ def may_leave(effect: str, other: str) -> bool:
     return known is None or left is None or known.may_leave(left)
 
 
-def log_odds_of_leak(observed: Observed, pair: Pair) -> tuple[str, float]:
+def log_odds_of_leak(observed: Observed, pair: Pair, *, also_off: float = 0.0) -> tuple[str, float]:
     """Which of two moves the probes more, and how much likelier its law's leaving the other's shape is than that effect: log of it.
+
+    also_off: what laws leave elsewhere, a misfit, over what they do: they may be off by as much here.
 
     Minus infinity where its law cannot. The likelihood of the weaker one's strength is integrated over what such a law leaves in
     place of that effect's prior. Of that shape a steady law leaves what is steady.
@@ -206,7 +208,7 @@ def log_odds_of_leak(observed: Observed, pair: Pair) -> tuple[str, float]:
         )
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
     shares = np.exp(shares - np.logaddexp.reduce(shares))
-    levels = map(at_most_off, LEVELS.levels)
+    levels = [max(at_most_off(level), also_off) for level in LEVELS.levels]
     acting = observed.acting([first.point])
     return strong, log_odds_of_leak_in(observed, second, acting, list(zip(shares, levels, strict=False)), shape=left)
 

@@ -1068,6 +1068,17 @@ def test_a_law_that_leaves_a_rest_in_one_place_is_as_exact_as_it_is_in_all_other
     assert low < 4.0 < high and (high - low) / value < 0.05
 
 
+@pytest.mark.parametrize(("rest_sd", "named"), [(0.0, ("effect0", "effect1")), (30.0, ("effect0",))])
+def test_a_law_that_leaves_a_rest_may_leave_as_much_in_the_shape_of_another_effect(rest_sd, named):
+    rng = np.random.default_rng(8)
+    strong, _, *others = independent((300, 1.0), (200, 1.0), *[(10, 1.0)] * 8)
+    weak = one_node("effect1", strong.response(1.0) * rng.choice((-1.0, 1.0), PROBES), low=0.01, high=100.0)
+    residual = 800.0 * strong.response(1.0) + 40.0 * weak.response(1.0) + rng.standard_normal(PROBES)
+    residual += np.where(GROUPS == 7, rest_sd * rng.standard_normal(PROBES), 0.0)
+    wide = [varied(one, high=5000.0) for one in (strong, weak, *others)]
+    assert weigh(residual, np.zeros((PROBES, 1)), wide)[0].effects == named
+
+
 def test_one_family_that_is_off_by_a_little_is_no_effect_and_several_are_an_unknown_one(setup):
     rng, factors, chosen = setup
     residual = noise(rng, factors)

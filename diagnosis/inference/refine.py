@@ -210,10 +210,13 @@ def _within_reach(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
         return []
     alone = {item.effects[0]: item.log_evidence for item in known if len(item.effects) == 1}
     top = known[0].log_evidence
+    # what draws every factor of a pattern explains any at once: it is no measure of what a law will when it is refined
+    by_law = max((value for effect, value in alone.items() if not EFFECTS[effect].drawn_in_full), default=top)
 
     def near(item: Hypothesis) -> bool:
         if len(item.effects) == 1:
-            return item.log_evidence > _REACH * top - _REACH_CHANCE
+            whole = top if EFFECTS[item.effects[0]].drawn_in_full else min(top, by_law)
+            return item.log_evidence > _REACH * whole - _REACH_CHANCE
         # the second of a pair: what it adds to the first, against what the best adds
         first = max(alone[effect] for effect in item.effects)
         best = max(top - first, 0.0)

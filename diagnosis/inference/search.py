@@ -11,6 +11,7 @@ from ..arrays import FloatArray
 from ..model.changes import Variant
 from ..model.curves import Curve
 from .curve_fits import CurveFit
+from .discrepancy import at_most_off
 from .seen import FitTarget
 
 _CENTRINGS, _CENTRED = 3, 0.15  # times that nodes are laid anew, and logarithm of the strength that needs none
@@ -19,7 +20,7 @@ ENOUGH, _ENOUGH_SHARE = 1.0, 1e-5  # gain of log evidence, and share of it, that
 # share of the gain that straight lines promise, below which slopes are asked anew
 # Source: Nocedal and Wright (2006), Numerical Optimization, algorithm 4.1
 _AS_HOPED = 0.25
-_STEP = 0.1  # of half a parameter's range: to find how responses change with it
+_STEP = 1.0  # of half a parameter's range, times the level by which the law is off: to find how responses change with it
 _FARTHEST = 0.6  # step in half ranges
 _FURTHER = 3.0  # times a step that explained more, tried as well where displacements and widths are sought
 _NEAR = (0.75, 1.0, 1.33)  # of the strength found: nodes of the refined curve
@@ -201,9 +202,10 @@ def slopes_of(curve: Curve, inner: Sequence[Parameter], strength: float, seen: F
     variant = curve.variant
     at = np.asarray(curve.response(strength))
     steps, asked = [], []
+    step = _STEP * at_most_off(seen.level)
     for item in inner:
         value = variant.parameters[item.name]
-        steps.append(_STEP if _moved(item, value, _STEP) != value else -_STEP)
+        steps.append(step if _moved(item, value, step) != value else -step)
         moved = {**variant.parameters, item.name: _moved(item, value, steps[-1])}
         asked.append(replace(variant, parameters=moved, strengths=(strength,)))
     answer = seen.ask(asked)

@@ -24,7 +24,7 @@ from raytwin.diagnosis.inference.nuisances import LocalNuisances, Nuisances, Whi
 from raytwin.diagnosis.inference.observed import Observed, Point
 from raytwin.diagnosis.inference.pairs import Single, log_prior, weigh_pairs
 from raytwin.diagnosis.inference.refine import tasks_of
-from raytwin.diagnosis.inference.search import Slopes, _in_turn, _within, searched
+from raytwin.diagnosis.inference.search import Slopes, _in_turn, _within, searched, slopes_of
 from raytwin.diagnosis.inference.seen import Blocks, FitTarget
 from raytwin.diagnosis.inference.steady import Steady
 from raytwin.diagnosis.inference.unknown import Families, fit_extra_variance
@@ -658,6 +658,47 @@ def test_reach_is_sought_before_shape_and_effects_of_a_leading_pair_alone_as_wel
         ("weak", None),
         ("weak", ("strong", 9.0)),
     ]
+
+
+def test_a_pattern_drawn_by_chance_keeps_no_law_from_being_refined():
+    def alone(effect, log_evidence):
+        return Hypothesis(
+            effects=(effect,),
+            probability=0.1,
+            log_evidence=log_evidence,
+            strengths={effect: (1.0, 1.0, 1.0)},
+            variants={effect: one_node(effect, np.ones(PROBES))},
+        )
+
+    laws = [alone("grey_absorber", 5000.0), alone("heel", 4000.0), alone("kv_error", 1000.0)]
+    assert [task.effect for task in tasks_of([alone("tile_gain", 10000.0), *laws])] == [
+        "tile_gain",
+        "grey_absorber",
+        "heel",
+    ]
+    assert [task.effect for task in tasks_of([alone("filtration_error", 10000.0), *laws])] == ["filtration_error"]
+
+
+@pytest.mark.parametrize(("level", "near"), [(0.1, 0.045), (0.025, 0.011), (0.0, 0.003)])
+def test_a_border_is_found_as_exactly_as_its_law_is_taken_to_be(level, near):
+    border = next(item for item in EFFECTS["grey_absorber"].parameters if item.name == "border")
+    places = np.linspace(-0.5, 0.5, PROBES)
+
+    def response(variant):
+        step = 1.0 / (1.0 + np.exp(-(places - variant.parameters["border"]) / 0.004))
+        return np.outer(variant.strengths, step)
+
+    def respond(variants, wanted=None):
+        return {number: response(variant) for number, variant in enumerate(variants)}
+
+    start = in_nodes("grey_absorber", np.zeros((1, PROBES)), [1.0], low=0.5, high=60.0, parameters={"border": 0.1})
+    start = replace(start, responses=response(start.variant))
+    plain = Whitening(np.zeros((PROBES, 1)), np.zeros(PROBES, dtype=int))
+    seen_there = FitTarget(observed=seen(np.zeros(PROBES)), respond=respond, whitening=plain, blocks=None, level=level)
+    slopes = slopes_of(start, [border], 1.0, seen_there)
+    # the part of the field that a step of the border crosses, and no more
+    crossed = np.abs(slopes.rows[0]) > 0.01 * np.abs(slopes.rows[0]).max()
+    assert np.ptp(places[crossed]) < near + 0.05
 
 
 def test_a_search_asks_the_series_that_tell_most_for_what_they_cost():

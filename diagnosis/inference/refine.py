@@ -202,6 +202,11 @@ def tasks_of(hypotheses: Sequence[Hypothesis]) -> list[Task]:
     return sorted(result, key=lambda task: (not task.leads, task.beside is not None, not task.moves_more))
 
 
+def _drawn_in_full(effect: str) -> bool:
+    """Whether the effect, of the catalogue, draws every factor of a pattern by chance."""
+    return effect in EFFECTS and EFFECTS[effect].drawn_in_full
+
+
 def _within_reach(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """The best known effect or pair, and those that refinement could bring past it, best first; none where no effect helps."""
     known = sorted((item for item in hypotheses if item.of_catalogue), key=lambda item: -item.log_evidence)
@@ -211,11 +216,11 @@ def _within_reach(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     alone = {item.effects[0]: item.log_evidence for item in known if len(item.effects) == 1}
     top = known[0].log_evidence
     # what draws every factor of a pattern explains any at once: it is no measure of what a law will when it is refined
-    by_law = max((value for effect, value in alone.items() if not EFFECTS[effect].drawn_in_full), default=top)
+    by_law = max((value for effect, value in alone.items() if not _drawn_in_full(effect)), default=top)
 
     def near(item: Hypothesis) -> bool:
         if len(item.effects) == 1:
-            whole = top if EFFECTS[item.effects[0]].drawn_in_full else min(top, by_law)
+            whole = top if _drawn_in_full(item.effects[0]) else min(top, by_law)
             return item.log_evidence > _REACH * whole - _REACH_CHANCE
         # the second of a pair: what it adds to the first, against what the best adds
         first = max(alone[effect] for effect in item.effects)

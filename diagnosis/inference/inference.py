@@ -23,7 +23,7 @@ from ...generator.effects import EFFECTS
 from ..arrays import FloatArray
 from ..model.curves import Curve
 from .curve_fits import IN_FULL, CurveFit, fit_curve, interval_of, log_mean_exp
-from .discrepancy import FARTHEST_LEVEL, LEVELS, at_most_off, log_frequency, log_misfit
+from .discrepancy import FARTHEST_LEVEL, LEVELS, at_most_off, log_frequency, log_misfit, only
 from .observed import Observed, Point
 from .pairs import Pair, Single, log_odds_of_leak, log_odds_of_leak_in, log_prior, may_leave, weigh_pairs
 from .unknown import LOG_DENSITY, ExtraVariance, Families, fit_extra_variance
@@ -237,9 +237,9 @@ class _Settled:
 
     def of_variants(self, fits: Sequence[CurveFit]) -> "_Settled":
         """With the strength of its one effect as all variants that are weighed in full leave it open."""
-        (effect,) = self.fits
-        observed = self.observed.conditioned(effect)
-        again = [fit_curve(observed, fit.curve) for fit in fits if len(fit.by_level) > 1]
+        ((effect, found),) = self.fits.items()
+        observed, levels = self.observed.conditioned(effect), only(found.level)
+        again = [fit_curve(observed, fit.curve, levels=levels) for fit in fits if len(fit.by_level) > 1]
         return replace(self, hypothesis=replace(self.hypothesis, strengths={effect: interval_of(again)}))
 
 

@@ -20,9 +20,8 @@ ENOUGH, _ENOUGH_SHARE = 1.0, 1e-5  # gain of log evidence, and share of it, that
 # share of the gain that straight lines promise, below which slopes are asked anew
 # Source: Nocedal and Wright (2006), Numerical Optimization, algorithm 4.1
 _AS_HOPED = 0.25
-_STEP = (
-    1.0  # of half a parameter's range, times the level by which the law is off: to find how responses change with it
-)
+# of half a parameter's range, times the level by which the law is off: to find how responses change with it
+_STEP = 1.0
 _FARTHEST = 0.6  # step in half ranges
 _FURTHER = 3.0  # times a step that explained more, tried as well where displacements and widths are sought
 _NEAR = (0.75, 1.0, 1.33)  # of the strength found: nodes of the refined curve

@@ -202,10 +202,11 @@ def _left_by_given(observed: Observed, weighed: Mapping[str, "_Settled"]) -> flo
     if not others:
         return None
     levels = [(1.0, at_most_off(observed.given[0].level))]
+    without_misfit = observed.acting(observed.given)
 
     def evidence(effect: str) -> float:
         own = weighed[effect]
-        acting = own.observed.acting(observed.given)
+        acting = without_misfit if own.observed is observed else own.observed.acting(observed.given)
         return own.hypothesis.log_evidence + log_odds_of_leak_in(own.observed, own.fits[effect], acting, levels)
 
     return max(map(evidence, others))

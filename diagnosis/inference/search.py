@@ -20,8 +20,6 @@ ENOUGH, _ENOUGH_SHARE = 1.0, 1e-5  # gain of log evidence, and share of it, that
 # share of the gain that straight lines promise, below which slopes are asked anew
 # Source: Nocedal and Wright (2006), Numerical Optimization, algorithm 4.1
 _AS_HOPED = 0.25
-# of half a parameter's range, times the level by which the law is off: to find how responses change with it
-_STEP = 1.0
 _FARTHEST = 0.6  # step in half ranges
 _FURTHER = 3.0  # times a step that explained more, tried as well where displacements and widths are sought
 _NEAR = (0.75, 1.0, 1.33)  # of the strength found: nodes of the refined curve
@@ -199,11 +197,14 @@ class Slopes:
 
 
 def slopes_of(curve: Curve, inner: Sequence[Parameter], strength: float, seen: FitTarget) -> Slopes:
-    """What small steps of the inner parameters do to a curve's response; those that cannot be asked are left out."""
+    """What small steps of the inner parameters do to a curve's response; those that cannot be asked are left out.
+
+    A step is that share of half a parameter's range by which the law is off: a law as good as exact is looked at as closely.
+    """
     variant = curve.variant
     at = np.asarray(curve.response(strength))
     steps, asked = [], []
-    step = _STEP * at_most_off(seen.level)
+    step = at_most_off(seen.level)
     for item in inner:
         value = variant.parameters[item.name]
         steps.append(step if _moved(item, value, step) != value else -step)

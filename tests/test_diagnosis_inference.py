@@ -18,7 +18,15 @@ from raytwin.diagnosis.inference.curve_fits import (
 )
 from raytwin.diagnosis.inference.discrepancy import LEVELS, group_factors
 from raytwin.diagnosis.inference.in_series import in_some_series
-from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, Priors, _singles, title_of, weigh_hypotheses
+from raytwin.diagnosis.inference.inference import (
+    UNKNOWN,
+    Hypothesis,
+    Priors,
+    _by_effects,
+    _singles,
+    title_of,
+    weigh_hypotheses,
+)
 from raytwin.diagnosis.inference.inner_parameters import with_inner_open
 from raytwin.diagnosis.inference.nuisances import LocalNuisances, Nuisances, Whitening, local_columns
 from raytwin.diagnosis.inference.observed import Observed, Point
@@ -440,6 +448,27 @@ def test_a_variant_counts_in_an_interval_as_much_as_its_evidence_says():
     own, twice = (np.interp(np.log(nodes), np.log(fit.strengths), fit.log_likelihood) for fit in (whole, seldom))
     wanted = interval_under(nodes, np.logaddexp(own, twice - np.log(2.0)))
     assert interval_of([whole, half]) == pytest.approx(wanted, rel=0.02)
+
+
+def test_bounds_of_a_strength_are_those_of_all_hypotheses_that_hold_the_effect_alone():
+    alike = [
+        Hypothesis(effects=("a",), probability=0.0, log_evidence=evidence, strengths={"a": strengths})
+        for evidence, strengths in ((10.0, (2.5, 2.2, 2.8)), (10.0 - np.log(3.0), (1.9, 1.8, 2.4)))
+    ]
+    nothing = Hypothesis(effects=(), probability=0.0, log_evidence=8.0)
+    found, _ = _by_effects([(nothing, 0.0), *((item, 0.0) for item in alike)])
+    value, low, high = found.strengths["a"]
+    rng = np.random.default_rng(7)
+    draws = []
+    for share, (middle, least, most) in ((0.75, (2.5, 2.2, 2.8)), (0.25, (1.9, 1.8, 2.4))):
+        sides = rng.standard_normal(int(share * 400_000)) / 1.959964
+        draws.append(middle * np.where(sides < 0.0, middle / least, most / middle) ** sides)
+    assert value == 2.5
+    assert (low, high) == pytest.approx(np.quantile(np.concatenate(draws), [0.025, 0.975]), rel=2e-3)
+    # one that is next to impossible changes nothing
+    seldom = replace(alike[1], log_evidence=-20.0)
+    kept, _ = _by_effects([(alike[0], 0.0), (seldom, 0.0), (nothing, 0.0)])
+    assert kept.strengths["a"] == pytest.approx((2.5, 2.2, 2.8), rel=1e-6)
 
 
 @pytest.mark.parametrize("sharpness", [0.3, 3.0, 30.0, 200.0])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import logsumexp
 
+from ...generator.line.twin import Z95
 from ..arrays import FloatArray
 from ..model.curves import Curve, places_of
 from .discrepancy import LEAST_MOVED, LEVELS, Levels, only
@@ -273,6 +274,28 @@ def interval_under(strengths: FloatArray, log_likelihood: FloatArray) -> tuple[f
     cumulated = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(x))])
     low, middle, high = np.interp([0.025, 0.5, 0.975], cumulated / cumulated[-1], x)
     return math.exp(middle), math.exp(low), math.exp(high)
+
+
+def interval_of_any(
+    intervals: Sequence[tuple[float, float, float]], shares: Sequence[float]
+) -> tuple[float, float, float]:
+    """The first's value, and 95 % bounds over all: each a Gaussian in the logarithm on either side of its median.
+
+    intervals: value and 95 % bounds; shares: probabilities, in any unit.
+    """
+    from scipy.optimize import brentq
+    from scipy.special import ndtr
+
+    values, lows, highs = np.log(np.asarray(intervals)).T
+    weights = np.asarray(shares) / np.sum(shares)
+    below, above = (np.maximum(side / Z95, 1e-9) for side in (values - lows, highs - values))
+
+    def beyond(x: float, probability: float) -> float:
+        return float(weights @ ndtr((x - values) / np.where(x < values, below, above))) - probability
+
+    ends = float(lows.min()) - 1e-6, float(highs.max()) + 1e-6
+    low, high = (math.exp(brentq(beyond, *ends, args=(probability,))) for probability in (0.025, 0.975))
+    return intervals[0][0], low, high
 
 
 def log_mean_exp(values: Sequence[float]) -> float:

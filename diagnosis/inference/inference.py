@@ -22,7 +22,7 @@ import numpy as np
 from ...generator.effects import EFFECTS
 from ..arrays import FloatArray
 from ..model.curves import Curve
-from .curve_fits import IN_FULL, CurveFit, fit_curve, interval_of, log_mean_exp
+from .curve_fits import IN_FULL, CurveFit, fit_curve, interval_of, interval_of_any, log_mean_exp
 from .discrepancy import FARTHEST_LEVEL, LEVELS, at_most_off, log_frequency, log_misfit, only
 from .observed import Observed, Point
 from .pairs import Pair, Single, log_odds_of_leak, log_odds_of_leak_in, log_prior, may_leave, weigh_pairs
@@ -213,18 +213,29 @@ def _left_by_given(observed: Observed, weighed: Mapping[str, "_Settled"]) -> flo
 
 
 def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis, ...]:
-    """Hypotheses with log priors as probabilities, those with the same effects as one, most probable first."""
+    """Hypotheses with log priors as probabilities, those with the same effects as one, most probable first.
+
+    One stands as its likeliest does; the bounds of its strengths are those of all of them.
+    """
     scores = np.array([item.log_evidence + prior for item, prior in weighed])
     shares = np.exp(scores - scores.max())
     shares /= shares.sum()
-    best: dict[tuple[str, ...], Hypothesis] = {}
-    total: dict[tuple[str, ...], float] = {}
+    alike: dict[tuple[str, ...], list[int]] = {}
     for number in np.argsort(-scores):
-        item = weighed[number][0]
-        total[item.effects] = total.get(item.effects, 0.0) + float(shares[number])
-        best.setdefault(item.effects, item)
-    every = [replace(item, probability=total[effects]) for effects, item in best.items()]
+        alike.setdefault(weighed[number][0].effects, []).append(int(number))
+    every = [_as_one([weighed[number][0] for number in own], shares[own]) for own in alike.values()]
     return tuple(sorted(every, key=lambda item: (-item.probability, -item.log_evidence)))
+
+
+def _as_one(alike: Sequence[Hypothesis], shares: FloatArray) -> Hypothesis:
+    """Hypotheses with the same effects, the likeliest first, as one; shares (hypothesis,): their probabilities."""
+    first, probability = alike[0], float(np.sum(shares))
+    if len(alike) == 1 or probability == 0.0:
+        return replace(first, probability=probability)
+    strengths = {
+        effect: interval_of_any([item.strengths[effect] for item in alike], shares) for effect in first.strengths
+    }
+    return replace(first, probability=probability, strengths=strengths)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ In how many families an unknown effect shows is not known: every number of them 
 """
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,47 +60,35 @@ def fit_extra_variance(
     Every family may have an extra variance tau^2, log-uniform over a grid; the evidence is that of the best combination (each
     family's tau in turn, several sweeps), its prior in it, of one family at least.
     """
-    residual, nuisances = observed.residual, observed.nuisances
-    factors = nuisances.full()
     members = [np.nonzero(families.of == number)[0] for number in range(len(families.names))]
     reached = frozenset(range(len(members))) if left_by is None else families.reached_by(left_by)
     open_ones = [number for number, part in enumerate(members) if len(part) and number in reached]
     if not open_ones:
-        return ExtraVariance(log_evidence=-math.inf, place="", variance=np.zeros(len(residual)))
-    grams = np.stack([factors[part].T @ factors[part] for part in members])
-    sums = np.stack([factors[part].T @ residual[part] for part in members])
-    squares = np.array([float(np.sum(residual[part] ** 2)) for part in members])
+        return ExtraVariance(log_evidence=-math.inf, place="", variance=np.zeros(len(observed.residual)))
     sizes = np.array([len(part) for part in members])
     count = len(open_ones)
     grid = np.concatenate([[0.0], SIZES])
-    normal = np.eye(factors.shape[1]) + grams.sum(axis=0)
-    tau2 = np.zeros(len(members))
+    weighted = _Weighted(observed, members)
     alone = np.full((len(members), len(grid)), -np.inf)
-    base, best = 0.0, -math.inf
-    for sweep in range(_SWEEPS):
+    base, best = weighted.log_likelihood, -math.inf
+    for _ in range(_SWEEPS):
         changed = False
         for g in open_ones:
-            part = members[g]
-            weights = 1.0 / (1.0 + tau2)
-            weights[g] = 0.0
-            without = normal - grams[g] / (1.0 + tau2[g])
-            rest: FloatArray = np.asarray(np.linalg.cholesky(without))
-            found = _at_each(1.0 / (1.0 + grid**2), rest, weights @ sums, factors[part], residual[part])
-            weights[g] = 1.0
-            found += 0.5 * float(sizes @ np.log(weights) - (weights @ squares - squares[g]))
-            others = int(np.count_nonzero(np.delete(tau2, g)))
-            if sweep == 0 and not others:
-                base = float(found[0])
+            others = int(np.count_nonzero(np.delete(weighted.weights, g) < 1.0))
+            found = weighted.at_each(g, 1.0 / (1.0 + grid**2))
+            if not others:
                 alone[g] = found
             found = found + _price(others, count)
             found[1:] += _price(others + 1, count) - _price(others, count)
             at = int(np.argmax(found))
-            changed |= bool(grid[at] ** 2 != tau2[g])
-            tau2[g] = grid[at] ** 2
-            normal = without + grams[g] / (1.0 + tau2[g])
+            weight = 1.0 / (1.0 + grid[at] ** 2)
+            if weight != weighted.weights[g]:
+                changed = True
+                weighted.weigh(g, weight)
             best = float(found[at])
         if not changed:
             break
+    tau2 = 1.0 / weighted.weights - 1.0
     own = alone[:, 1:] - base
     if not np.any(tau2):
         best = float(own.max()) + _price(1, count) + base
@@ -119,28 +107,61 @@ def _price(shown: int, count: int) -> float:
     return -math.log(count) - ways - shown * math.log(len(SIZES))
 
 
-def _at_each(
-    weights: FloatArray, rest: FloatArray, vector: FloatArray, factors: FloatArray, residual: FloatArray
-) -> FloatArray:
-    """Log likelihood (weight,) with the probes of one group counting so much, but for a constant that they do not change.
+class _Weighted:
+    """The likelihood of a residual with each family of probes counting so much, kept up to date as weights change."""
 
-    weights: one over these probes' variance (weight,); rest: Cholesky factor of the precision of nuisances that all others leave
-    (factor, factor); vector: what these say of them (factor,); factors (probe, factor) and residual (probe,): of the group.
-    """
-    from scipy.linalg import solve_triangular
+    def __init__(self, observed: Observed, members: Sequence[IndexArray]) -> None:
+        """All families count in full; members: probes of each."""
+        self._factors, self._residual, self._members = observed.nuisances.full(), observed.residual, members
+        self.weights = np.ones(len(members))  # one over the variance of the probes of each family
+        self._normal = np.eye(self._factors.shape[1]) + self._factors.T @ self._factors
+        self._asked = self._factors.T @ self._residual
+        self._squares = float(self._residual @ self._residual)
+        self._settle()
 
-    right = np.concatenate([factors, vector[None, :]]).T
-    solved = solve_triangular(rest, right, lower=True, check_finite=False).T
-    across, asked = solved[:-1], solved[-1]
-    values, vectors = np.linalg.eigh(across @ across.T)
-    values = np.maximum(values, 0.0)
-    own = across.T @ residual
-    # both along the eigenvectors of what the group sees of the nuisances
-    of_asked, of_own = vectors.T @ (across @ asked), values * (vectors.T @ residual)
-    grown = 1.0 + np.multiply.outer(weights, values)
-    along = of_asked + np.multiply.outer(weights, of_own)
-    explained = float(asked @ asked) + 2.0 * weights * float(asked @ own) + weights**2 * float(own @ own)
-    explained -= np.sum(weights[:, None] * along**2 / grown, axis=1)
-    determinant = 2.0 * float(np.sum(np.log(np.diag(rest)))) + np.sum(np.log(grown), axis=1)
-    spread = len(residual) * np.log(weights) - weights * float(residual @ residual)
-    return np.asarray(0.5 * (spread + explained - determinant))
+    def weigh(self, family: int, weight: float) -> None:
+        """Let a family count so much from here on."""
+        more = weight - self.weights[family]
+        factors, residual = self._factors[self._members[family]], self._residual[self._members[family]]
+        self._normal += more * (factors.T @ factors)
+        self._asked += more * (factors.T @ residual)
+        self._squares += more * float(residual @ residual)
+        self.weights[family] = weight
+        self._settle()
+
+    def _settle(self) -> None:
+        from scipy.linalg import solve_triangular
+
+        self._root: FloatArray = np.asarray(np.linalg.cholesky(self._normal))
+        self._left = solve_triangular(self._root, self._asked, lower=True, check_finite=False)
+        sizes = np.array([len(part) for part in self._members])
+        spread = float(sizes @ np.log(self.weights)) - self._squares
+        explained = float(self._left @ self._left) - 2.0 * float(np.sum(np.log(np.diag(self._root))))
+        self.log_likelihood = 0.5 * (spread + explained)  # but for a constant
+
+    def at_each(self, family: int, weights: FloatArray) -> FloatArray:
+        """The log likelihood with one family counting as much as each of some weights (weight,) has it.
+
+        With N = L L^T the nuisances' precision, S = L^-1 F^T (factor, probe) of the family and S^T S = V D V^T, more weight d makes
+        N + d F^T F of it, whose inverse and determinant are those of N with 1 + d D along the columns of S V.
+        """
+        from scipy.linalg import solve_triangular
+
+        part = self._members[family]
+        residual, more = self._residual[part], weights - self.weights[family]
+        seen = solve_triangular(self._root, self._factors[part].T, lower=True, check_finite=False)
+        own = seen @ residual
+        if len(part) <= len(seen):
+            values, vectors = np.linalg.eigh(seen.T @ seen)
+            values = np.maximum(values, 0.0)
+            of_left, of_own = vectors.T @ (seen.T @ self._left), values * (vectors.T @ residual)
+        else:
+            values, vectors = np.linalg.eigh(seen @ seen.T)
+            values = np.maximum(values, 0.0)
+            of_left, of_own = np.sqrt(values) * (vectors.T @ self._left), np.sqrt(values) * (vectors.T @ own)
+        grown = 1.0 + np.multiply.outer(more, values)
+        along = of_left + np.multiply.outer(more, of_own)
+        explained = 2.0 * more * float(own @ self._left) + more**2 * float(own @ own)
+        explained -= np.sum(more[:, None] * along**2 / grown, axis=1)
+        spread = len(part) * np.log(weights / self.weights[family]) - more * float(residual @ residual)
+        return np.asarray(self.log_likelihood + 0.5 * (spread + explained - np.sum(np.log(grown), axis=1)))

@@ -99,31 +99,20 @@ def weigh_hypotheses(
 
     Args:
         seen: what is weighed, and the fits of each effect's curves, variants with equal prior, to it; several of these for several
-            levels by which laws of the twin's own effects may be off, over which the evidence is averaged; misfits are asked for at
-            those that are likely without.
+            levels by which laws of the twin's own effects may be off, over which the evidence is averaged.
         families: of probes, in which an unknown effect may show.
         of_catalogue: number of effects that share the priors, those that cannot show here among them; at least those with fits.
         misfits: laws may leave a misfit; False: they may not, a first look at a third of the cost.
         beside: curves of effects as they respond beside another.
     """
-
-    def weigh(number: int, misfits: bool) -> list[tuple[Hypothesis, float]]:
-        observed, fits = seen[number]
+    weighed: list[tuple[Hypothesis, float]] = []
+    for observed, fits in seen:
         # one zero for all, and how often laws are off by so much
         zero = observed.conditioned().log_likelihood - seen[0][0].conditioned().log_likelihood
         zero += log_frequency(observed.given[0].level) if len(seen) > 1 else 0.0
         found = _weighed(observed, fits, families, priors or Priors(), of_catalogue, misfits, beside)
-        return [(replace(item, log_evidence=item.log_evidence + zero), prior) for item, prior in found]
-
-    if len(seen) == 1:
-        return _by_effects(weigh(0, misfits))
-    looks = [weigh(number, False) for number in range(len(seen))]
-    if misfits:
-        at_best = [max(item.log_evidence + prior for item, prior in look) for look in looks]
-        for place, number in enumerate(np.argsort(at_best)[::-1]):
-            if place < IN_FULL or at_best[number] > max(at_best) - _NEAR:
-                looks[number] = weigh(int(number), True)
-    return _by_effects([item for look in looks for item in look])
+        weighed += [(replace(item, log_evidence=item.log_evidence + zero), prior) for item, prior in found]
+    return _by_effects(weighed)
 
 
 def _weighed(

@@ -45,17 +45,20 @@ def test_darks_of_exact_zeros_are_compared_and_show_no_gap(diagnosed):
 
 
 @pytest.mark.parametrize(
-    ("effect", "low", "high"),
+    ("effect", "widest"),
     [
-        pytest.param("image_lag=1", 0.7, 1.4, marks=pytest.mark.slow),
-        pytest.param("output_drift=1", 0.5, 2.0, marks=pytest.mark.slow),
-        pytest.param("kv_error=2", 1.7, 2.3, marks=pytest.mark.slow),
+        pytest.param("image_lag=1", 2.0, marks=pytest.mark.slow),
+        pytest.param("output_drift=1", 4.0, marks=pytest.mark.slow),
+        # so short a session hardly parts a voltage from a filtration
+        pytest.param("kv_error=2", 1.7, marks=pytest.mark.slow),
     ],
 )
-def test_an_effect_is_named_where_darks_are_exact_zeros(diagnosed, effect, low, high):
+def test_an_effect_is_named_where_darks_are_exact_zeros(diagnosed, effect, widest):
     found = diagnosed(effect)
-    assert found.named == (effect.split("=")[0],)
-    assert low < found.causes[0].strength[0] < high
+    name, planted = effect.split("=")
+    assert found.named == (name,)
+    _, low, high = found.causes[0].strength
+    assert low < float(planted) < high < widest * low
 
 
 @pytest.mark.slow

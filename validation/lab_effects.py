@@ -1,4 +1,4 @@
-"""Each effect of the virtual lab alone, but a composition: is it named, and does the interval of its strength hold what was planted?
+"""Each effect that the virtual lab draws alone, but a composition: is it named, and does the interval of its strength hold what was planted?
 
     python validation/lab_effects.py --seed 2960 --json build/lab_effects/2960.json [--only EFFECT ...]
     python validation/lab_effects.py --strengths build/lab_effects/*.json
@@ -98,7 +98,7 @@ def main() -> None:
         tell_strengths(options.strengths)
         return
     rows = []
-    shown = [effect for effect in LAWS if effect in EFFECTS and effect not in HARDLY_SHOWN]
+    shown = [effect for effect, law in LAWS.items() if effect in EFFECTS and law.drawn and effect not in HARDLY_SHOWN]
     for number, effect in enumerate(shown):
         if options.only and effect not in options.only:
             continue

@@ -1,4 +1,4 @@
-"""Each effect that the virtual lab draws alone, but a composition: is it named, and does the interval of its strength hold what was planted?
+"""Each effect that the virtual lab draws, alone (but a composition): is it named, and does its interval hold what was planted?
 
     python validation/lab_effects.py --seed 2960 --json build/lab_effects/2960.json [--only EFFECT ...]
     python validation/lab_effects.py --strengths build/lab_effects/*.json

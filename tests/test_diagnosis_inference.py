@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from raytwin.diagnosis.inference.curve_fits import (
     CurveFit,
@@ -35,7 +36,7 @@ from raytwin.diagnosis.inference.refine import tasks_of
 from raytwin.diagnosis.inference.search import Slopes, _in_turn, _within, searched, slopes_of
 from raytwin.diagnosis.inference.seen import Blocks, FitTarget
 from raytwin.diagnosis.inference.steady import Steady
-from raytwin.diagnosis.inference.unknown import Families, fit_extra_variance
+from raytwin.diagnosis.inference.unknown import Families, _Weighted, fit_extra_variance
 from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _causes, _strained, _with_curves, verdict_of
 from raytwin.diagnosis.judgement.strengths import _outright, applied_at_best
 from raytwin.diagnosis.model.changes import Variant
@@ -1161,6 +1162,33 @@ def test_one_family_that_is_off_by_a_little_is_no_effect_and_several_are_an_unkn
     much = residual.copy()
     much[GROUPS == 7] += 2.5 * rng.standard_normal(20)
     assert fit_extra_variance(seen(much, factors), Families(of=GROUPS, names=NAMES)).place == "group 7"
+
+
+@pytest.mark.parametrize("per_family", [20, 200])
+def test_likelihoods_of_families_that_count_less_are_those_of_their_covariance(per_family):
+    rng = np.random.default_rng(12)
+    factors = 3.0 * rng.standard_normal((PROBES, 40))
+    residual = factors @ rng.standard_normal(40) + rng.standard_normal(PROBES)
+    members = np.split(np.arange(PROBES), PROBES // per_family)
+    weighted = _Weighted(seen(residual, factors), members)
+
+    def of_covariance(weights):
+        variance = np.repeat(1.0 / np.asarray(weights), per_family)
+        return multivariate_normal.logpdf(residual, cov=factors @ factors.T + np.diag(variance))
+
+    plain = np.ones(len(members))
+    constant = weighted.log_likelihood - of_covariance(plain)
+    weighted.weigh(1, 0.2)
+    weighted.weigh(2, 0.01)
+    weighted.weigh(1, 0.05)
+    asked = np.array([1.0, 0.05, 1e-6])
+    for family in (0, 1):
+        found = weighted.at_each(family, asked)
+        for weight, value in zip(asked, found, strict=True):
+            weights = plain.copy()
+            weights[[1, 2]] = 0.05, 0.01
+            weights[family] = weight
+            assert value - constant == pytest.approx(of_covariance(weights), abs=1e-6)
 
 
 def test_a_law_leaves_no_rest_in_what_one_effect_alone_can_make(setup):

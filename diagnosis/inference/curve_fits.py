@@ -277,7 +277,7 @@ def interval_under(strengths: FloatArray, log_likelihood: FloatArray) -> tuple[f
 
 
 def interval_of_any(
-    intervals: Sequence[tuple[float, float, float]], shares: Sequence[float] | FloatArray | FloatArray
+    intervals: Sequence[tuple[float, float, float]], shares: Sequence[float] | FloatArray
 ) -> tuple[float, float, float]:
     """The first's value, and 95 % bounds over all: each a Gaussian in the logarithm on either side of its median.
 

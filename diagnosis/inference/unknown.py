@@ -151,13 +151,14 @@ class _Weighted:
         residual, more = self._residual[part], weights - self.weights[family]
         seen = solve_triangular(self._root, self._factors[part].T, lower=True, check_finite=False)
         own = seen @ residual
+        most = 1.0 / self.weights[family]  # N holds the family's own part, so that D is less than this
         if len(part) <= len(seen):
             values, vectors = np.linalg.eigh(seen.T @ seen)
-            values = np.maximum(values, 0.0)
+            values = np.clip(values, 0.0, most)
             of_left, of_own = vectors.T @ (seen.T @ self._left), values * (vectors.T @ residual)
         else:
             values, vectors = np.linalg.eigh(seen @ seen.T)
-            values = np.maximum(values, 0.0)
+            values = np.clip(values, 0.0, most)
             of_left, of_own = np.sqrt(values) * (vectors.T @ self._left), np.sqrt(values) * (vectors.T @ own)
         grown = 1.0 + np.multiply.outer(more, values)
         along = of_left + np.multiply.outer(more, of_own)

@@ -45,19 +45,20 @@ def test_darks_of_exact_zeros_are_compared_and_show_no_gap(diagnosed):
 
 
 @pytest.mark.parametrize(
-    ("effect", "widest"),
+    ("effect", "least", "most", "widest"),
     [
-        pytest.param("image_lag=1", 2.0, marks=pytest.mark.slow),
-        pytest.param("output_drift=1", 4.0, marks=pytest.mark.slow),
+        pytest.param("image_lag=1", 0.7, 1.4, 2.0, marks=pytest.mark.slow),
+        pytest.param("output_drift=1", 0.5, 2.0, 4.0, marks=pytest.mark.slow),
         # so short a session hardly parts a voltage from a filtration
-        pytest.param("kv_error=2", 1.7, marks=pytest.mark.slow),
+        pytest.param("kv_error=2", 1.5, 2.6, 1.7, marks=pytest.mark.slow),
     ],
 )
-def test_an_effect_is_named_where_darks_are_exact_zeros(diagnosed, effect, widest):
+def test_an_effect_is_named_where_darks_are_exact_zeros(diagnosed, effect, least, most, widest):
     found = diagnosed(effect)
     name, planted = effect.split("=")
     assert found.named == (name,)
-    _, low, high = found.causes[0].strength
+    value, low, high = found.causes[0].strength
+    assert least < value < most
     assert low < float(planted) < high < widest * low
 
 

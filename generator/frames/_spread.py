@@ -202,6 +202,9 @@ def spread_maps(
     shape = (signal_DN.shape[0], signal_DN.shape[1])
     from scipy.fft import dctn
 
+    def once(name: object, make: Callable[[], Any]) -> Any:
+        return make() if kept is None else kept(name, make)
+
     fine = state.picture
     nothing = np.zeros((1, 1))
     along = (
@@ -239,7 +242,7 @@ def spread_maps(
                 blur = object_transfer(state, f_row, f_column)
                 return whole if blur is None else whole * blur
 
-            return np.asarray(made() if kept is None else kept((shape, *counts), made))
+            return np.asarray(once((shape, *counts), made))
 
         pictures: list[tuple[NDArray[np.floating], NDArray[np.inexact]]] = []
         if fine is not None:
@@ -251,7 +254,7 @@ def spread_maps(
     radial_px, turn_px = state.distortion_px
     blurred = distorted(np.asarray(blurred, dtype=np.float64), radial_px=radial_px, turn_px=turn_px)
     f_row, f_column = _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :]
-    blur = object_transfer(state, f_row, f_column)
+    blur = once(("object", shape), lambda: object_transfer(state, f_row, f_column))
     if draft:
         variance = (
             variance_DN2 if blur is None else sampled_picture([(dctn(variance_DN2, type=2), blur)], shape, (0.0, 0.0))

@@ -245,7 +245,7 @@ def write_acquisition(
     Args:
         path: the file to write; an existing one is replaced.
         instrument: what is known about the line.
-        compression: None (fastest), `lzf` or `gzip`, for the frames.
+        compression: None (fastest), `gzip`, or `lzf` (not the same bytes each time), for the frames.
 
     Raises:
         InputError: what was written does not make a valid file (no series, a series without frames, masks of

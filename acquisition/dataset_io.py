@@ -17,6 +17,7 @@ from ..errors import FileFormatError, InputError
 from ..files import whole_file
 from ..results import Table, counted
 from ._hdf5 import (
+    QUICK_GZIP,
     check_format,
     check_open,
     check_stored,
@@ -421,7 +422,7 @@ def _growing(file: Any, name: str, shape: tuple[int, ...], dtype: Any) -> Any:
         maxshape=(None, *shape),
         dtype=dtype,
         chunks=(1, *shape),
-        compression="lzf",
+        **QUICK_GZIP,
         shuffle=np.dtype(dtype).itemsize > 1,
     )
 

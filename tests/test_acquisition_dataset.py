@@ -259,5 +259,5 @@ def test_every_image_is_a_compressed_chunk_of_its_own(tmp_path):
     with h5py.File(path) as file:
         for name, chunk in (("images", (1, 2, 64, 80)), ("counts", (1, 2, 64, 80)), ("product_masks", (1, 64, 80))):
             assert file[name].chunks == chunk
-            assert file[name].compression == "lzf"
+            assert file[name].compression == "gzip"  # LZF does not give the same bytes each time
         assert file["counts"].id.get_storage_size() < 0.5 * file["counts"].size * 4

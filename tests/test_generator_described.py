@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_edt
 
 from raytwin.acquisition import Setting, read_dataset
+from raytwin.acquisition.contrast import delta_r, object_and_ring
 from raytwin.acquisition.setting import filters_from_text
 from raytwin.cli import main
 from raytwin.errors import FileFormatError, InputError
@@ -271,6 +272,25 @@ def test_rows_say_what_is_in_the_image(tmp_path, twin):
         assert {"train", "val", "test"} == set.union(*by_product.values())
         with_object = sum(bool(row.foreign_object) for row in dataset.rows)
         assert 4 <= with_object <= 15
+
+
+def test_the_contrast_of_an_object_holds_nothing_of_an_edge_beside_it(tmp_path, twin):
+    box = PRODUCT.replace("fillet", "box").replace("chicken_breast", "Al")
+    ball = WIRE.replace('"wire"', '"ellipsoid"').replace('"on"', '"inside"').replace("[3, 6]", "1.2")
+    ball = ball.replace("diameter_mm = 0.4", "width_mm = 1.2\nheight_mm = 1.2")
+    scenes = DescribedScenes(twin, described(tmp_path, box + ball), low=LOW, high=HIGH, seed=5)
+    off, depths_px = [], []
+    for number in range(80):
+        pair = scenes.pair(number)
+        if pair.row.foreign_object:
+            images = [image.log_image for image in pair.expected]
+            _, ring = object_and_ring(*images, pair.foreign_object_mask, dilations=7)
+            depths_px.append(distance_transform_edt(pair.product_mask)[ring].min())
+            off.append(delta_r(*images, pair.foreign_object_mask, dilations=7) / pair.row.contrast - 1.0)
+            assert pair.row.contrast == pytest.approx(-0.1, abs=0.06)  # balls of one size
+    middle, beside = np.abs(off)[np.array(depths_px) > 4], np.abs(off)[np.array(depths_px) <= 1]
+    assert middle.size > 3 and middle.max() < 0.01
+    assert beside.size > 3 and np.median(beside) > 0.5
 
 
 @pytest.mark.parametrize("ending", ["npz", "h5", "tiff"])

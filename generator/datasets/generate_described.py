@@ -34,6 +34,7 @@ from .render import (
     trace_scene,
 )
 
+_Images = tuple[ExpectedImage | AffectedImage, ExpectedImage | AffectedImage]  # (low, high)
 _POSE, _NOISE, _PRODUCT, _SPLIT = 2, 1, 3, 4  # places of the random streams of a seed
 
 
@@ -42,7 +43,7 @@ class DescribedPair:
     """A scene and what the detector shows of it on average: the images (low, high), masks (row, column) and the row."""
 
     scene: Scene
-    expected: tuple[ExpectedImage | AffectedImage, ExpectedImage | AffectedImage]
+    expected: _Images
     foreign_object_mask: NDArray[np.bool_]
     product_mask: NDArray[np.bool_]
     row: DatasetRow
@@ -139,9 +140,29 @@ class DescribedScenes:
         which = number % known if known else number
         product = self._product(which)
         scene = sample_scene(self.description, product, rays=self.geometry.rays(), rng=rng)
+        rendered, expected = self._seen(scene)
+        foreign = _mask(rendered.foreign_cover)
+        inside = _mask(rendered.cover)
+        objects = [one.individual for one in scene.foreign_objects]
+        return DescribedPair(
+            scene=scene,
+            expected=expected,
+            foreign_object_mask=foreign,
+            product_mask=inside | foreign,
+            row=DatasetRow(
+                image=f"{number:05d}",
+                product=product.name,
+                foreign_object="+".join(one.name for one in objects),
+                size_mm=max((one.size_mm for one in objects), default=math.nan),
+                contrast=self._contrast(scene, expected, foreign),
+                split=self._split(which),
+                setting=";".join(map(str, self.settings)),
+            ),
+        )
+
+    def _seen(self, scene: Scene) -> tuple[RenderedScene | TracedScene, _Images]:
+        """A scene as it is projected, and its images (low, high) without noise."""
         effects = [model.image_effects for model in self.models]
-        rendered: RenderedScene | TracedScene
-        expected: tuple[ExpectedImage | AffectedImage, ...]
         if effects[0] is None:
             rendered = render_scene(
                 scene,
@@ -150,39 +171,22 @@ class DescribedScenes:
                 geometry=self.geometry,
                 supersampling=self.supersampling,
             )
-            expected = rendered.images
-        else:
-            rendered = trace_scene(
-                scene,
-                twin=self.twin,
-                channels=self._channels,
-                geometry=self.geometry,
-                supersampling=FINE,
-                attenuation_scale=effects[0].attenuation_scale,
-            )
-            expected = tuple(
-                one.image(*moments, rendered.lengths_mm, focal_blur_px=self.geometry.focal_blur_px)
-                for one, moments in zip(effects, rendered.moments, strict=True)
-                if one is not None
-            )
-        foreign = _mask(rendered.foreign_cover)
-        inside = _mask(rendered.cover)
-        objects = [one.individual for one in scene.foreign_objects]
-        return DescribedPair(
-            scene=scene,
-            expected=(expected[0], expected[1]),
-            foreign_object_mask=foreign,
-            product_mask=inside | foreign,
-            row=DatasetRow(
-                image=f"{number:05d}",
-                product=product.name,
-                foreign_object="+".join(one.name for one in objects),
-                size_mm=max((one.size_mm for one in objects), default=math.nan),
-                contrast=self._contrast(expected, foreign),
-                split=self._split(which),
-                setting=";".join(map(str, self.settings)),
-            ),
+            low, high = rendered.images
+            return rendered, (low, high)
+        traced = trace_scene(
+            scene,
+            twin=self.twin,
+            channels=self._channels,
+            geometry=self.geometry,
+            supersampling=FINE,
+            attenuation_scale=effects[0].attenuation_scale,
         )
+        affected = [
+            one.image(*moments, traced.lengths_mm, focal_blur_px=self.geometry.focal_blur_px)
+            for one, moments in zip(effects, traced.moments, strict=True)
+            if one is not None
+        ]
+        return traced, (affected[0], affected[1])
 
     def draw(self, pair: DescribedPair, rng: np.random.Generator) -> NDArray[np.float32]:
         """Counts with dark (2, row, column) of a pair, DN; each call draws its own noise."""
@@ -219,14 +223,19 @@ class DescribedScenes:
         value = float(np.random.default_rng([self.seed, _SPLIT, product]).random())
         return "test" if value < test else "val" if value < test + validation else "train"
 
-    def _contrast(self, expected: tuple[ExpectedImage | AffectedImage, ...], mask: NDArray[np.bool_]) -> float:
+    def _contrast(self, scene: Scene, expected: _Images, mask: NDArray[np.bool_]) -> float:
         if not mask.any():
             return math.nan
+        _, alone = self._seen(replace(scene, foreign_objects=()))
         dilations = dilations_for_pixel(self.geometry.pixel_mm)
         try:
-            return delta_r(expected[0].log_image, expected[1].log_image, mask, dilations=dilations)
+            return delta_r(*_log_images(expected), mask, dilations=dilations, alone=_log_images(alone))
         except InputError:
             return math.nan  # an object beside the product or across all of it has no ring to be compared with
+
+
+def _log_images(images: _Images) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    return images[0].log_image, images[1].log_image
 
 
 def _mask(cover: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -255,7 +264,8 @@ def generate_from_description(
     """Write `images` image pairs at (low, high) of scenes drawn from a description, with masks, contrasts and splits.
 
     Scene and noise of an image depend on the seed and its number alone. Contrasts are those of the noiseless pair, against
-    a ring as wide in mm as 21 pixels of 0.15 mm. Masks hold the pixels that are at least half covered.
+    a ring as wide in mm as 21 pixels of 0.15 mm, less what the product alone shows there (`delta_r`). Masks hold the pixels
+    that are at least half covered.
 
     Raises:
         InputError: see `DescribedScenes`; nothing is left behind.

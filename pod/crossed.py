@@ -110,7 +110,7 @@ def fit_crossed(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
     for name, value in sd.items():
         if value > LARGEST_SD:
             notes.append(
-                f"the spread between {name}s is so large that {name}s are all hits or all misses; mind the fit"
+                f"the spread between {name}s is larger than these looks can tell: nearly each is all hits or all misses"
             )
     c0, c1 = mixed.coefficients
     smallest, largest = float(x.min()), float(x.max())

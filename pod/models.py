@@ -121,16 +121,22 @@ def with_links_open(
 
     Returns:
         The fit, its bounds as wide as those of all curves that fit where another one fits better and no link was asked for; those
-        curves joined; a warning where another one fits better. The fit as it came and two times None where looks repeat, hits and
-        misses separate or the fit is not the most likely one.
+        curves joined; a warning where another one fits better. The fit as it came and two times None where looks repeat and are not
+        clusters, hits and misses separate or the fit is not the most likely one.
     """
-    joined = over_links(found, link=fit.link, log_size=fit.log_size)
-    if fit.repeats != "pooled" or fit.method != "ml" or fit.separated or joined is None:
+    times = _looks_a_trial(fit)
+    if times is None or fit.method != "ml" or fit.separated:
         return fit, None, None
-    best = better_curve(found, fit)
+    found = tuple(replace(one, aic=_criterion(one.aic, one.deviance, times)) for one in found)
+    own = replace(fit, aic=_criterion(fit.aic, fit.deviance, times))
+    joined = over_links(found, link=fit.link, log_size=fit.log_size)
+    if joined is None:
+        return fit, None, None
+    best = better_curve(found, own)
     if best is None:
         return fit, joined, None
-    told = f"another curve fits better: {best.name} (AIC lower by {(fit.aic or 0.0) - (best.aic or 0.0):.3g}"
+    told = f"another curve fits better: {best.name} ({'AIC' if fit.repeats == 'pooled' else 'QAIC'} lower by"
+    told += f" {(own.aic or 0.0) - (best.aic or 0.0):.3g}"
     if not named and _ends_below_90(best):
         told += "); it ends below 90 %, so there is no a90"
     else:
@@ -141,6 +147,23 @@ def with_links_open(
         if not named:
             told += _without_bounds([one for one in found if one.name in joined.curves])
     return fit if named else _widened(fit, joined, best), joined, told
+
+
+def _looks_a_trial(fit: PodFit) -> float | None:
+    """How many looks count as one: 1 of independent ones; of clusters the slope's variance over that of such; None: not known."""
+    if fit.repeats == "pooled":
+        return 1.0
+    if fit.clustered is None or fit.naive is None or not fit.naive.se1:
+        return None
+    slope = np.array([0.0, 1.0])
+    # what a curve of another shape does to both is no repeat
+    independent = float(fit.clustered.cells[1, 1]) or fit.naive.se1**2
+    return max(float(fit.clustered.variance(slope)[0]) / independent, 1.0)
+
+
+def _criterion(aic: float | None, deviance: float | None, times: float) -> float | None:
+    """AIC where so many looks count as one: QAIC (Burnham & Anderson 2002, 2.5)."""
+    return None if aic is None or deviance is None else deviance / times + (aic - deviance)
 
 
 def _without_bounds(alike: list[Alternative]) -> str:

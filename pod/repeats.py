@@ -124,7 +124,7 @@ def fit_crossed_where_finite(table: Trials, *, link: Link, log_size: bool, metho
         if not endless:
             return fit
         which = " and ".join(f"{name}s" for name in endless)
-        why = f"the spread between {which} has no finite estimate ({which} are all hits or all misses)"
+        why = f"the spread between {which} is larger than these looks can tell"
     clustered = fit_cluster(table, link=link, log_size=log_size, method=method)
     told = f"{why}: curve and bounds are the clustered ones (repeats cluster)"
     return replace(clustered, warnings=(told, *clustered.warnings))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import raytwin as rt
+from raytwin.acquisition import open_acquisition
 from raytwin.acquisition.acquisition_io import write_acquisition
 from raytwin.cli import main
 
@@ -58,6 +59,9 @@ def test_planted_noise_is_named_with_its_strength_and_written_into_the_twin(sess
     (noise,) = [row for row in found["held_out"] if row["axis"] == "noise"]
     assert noise["after"] < 0.7 * noise["before"]
     assert {place["axis"] for place in found["where"]} >= {"noise"}
+    with open_acquisition(sessions / "noisy.h5") as session:
+        before = {series.name for series in session.series if series.role == "calibration"}
+    assert before.isdisjoint(place["series"] for place in found["where"])  # the noise began after these
     assert sum(item["probability"] for item in found["hypotheses"]) == pytest.approx(1.0, abs=1e-6)
     from raytwin.generator.twins.twin_io import read_twin
 

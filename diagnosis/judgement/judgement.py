@@ -10,7 +10,7 @@ from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.line.twin import Twin
 from ..advice.next_series import best_measurement
 from ..advice.plan import advice_text, best_repeat
-from ..arrays import FloatArray
+from ..arrays import BoolArray, FloatArray
 from ..inference.curve_fits import CurveFit, fit_effects
 from ..inference.discrepancy import FARTHEST_LEVEL, LEVELS, law_terms
 from ..inference.in_series import in_some_series
@@ -21,7 +21,7 @@ from ..inference.observed import Observed
 from ..inference.refine import SEEN_FROM, refine
 from ..inference.steady import Steady
 from ..model.changes import EACH_SCENE, Variant
-from ..model.curves import Curve
+from ..model.curves import LEAST_RESPONSE, Curve
 from ..problem.problem import Problem
 from .answer import NO_GAP_FROM, Cause, Diagnosis, Place, improved
 from .held_out import MOST, held_out
@@ -61,7 +61,7 @@ def judge(
         probability_no_gap=next((item.probability for item in verdict.hypotheses if not item.effects), 0.0),
         probability_unknown=marginal.get(UNKNOWN, 0.0),
         unknown_location=next((item.location for item in verdict.hypotheses if item.effects == (UNKNOWN,)), ""),
-        where=_places(problem, nuisances.given_others(problem.residual)),
+        where=_places(problem, np.where(_acted_on(problem, leading), nuisances.given_others(problem.residual), 0.0)),
         threshold_z=_threshold(len(problem.residual)),
         gap=gap,
         held_out=by_axis,
@@ -315,6 +315,24 @@ def _places_left(problem: Problem, leading: Hypothesis) -> tuple[Place, ...]:
     root = np.sqrt(variance)
     nuisances = LocalNuisances(factors / root[:, None], problem.blocks)
     return _places(problem, nuisances.given_others(problem.left_by(leading.points()) / root))
+
+
+def _acted_on(problem: Problem, leading: Hypothesis) -> BoolArray:
+    """Probes (probe,) of series in which what is named does anything; all of them where nothing is named.
+
+    What began since calibration parts the series before from those after, and each lies off if the others are believed.
+    """
+    if not leading.of_catalogue:
+        return np.ones(len(problem.residual), dtype=bool)
+    moved = np.zeros(len(problem.residual))
+    for point in leading.points():
+        curve = point.curve
+        by_chance = point.strength * np.sqrt(
+            np.sum(curve.chance**2, axis=1) + (0.0 if curve.jitter is None else curve.jitter)
+        )
+        moved += np.abs(curve.response(point.strength)) + by_chance
+    acts = np.bincount(problem.series_of, weights=moved > LEAST_RESPONSE) > 0
+    return np.asarray(acts[problem.series_of])
 
 
 def _places(problem: Problem, z: FloatArray) -> tuple[Place, ...]:

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.frames.robust import robust_sd
+from ..errors import FileFormatError, InputError
+from ..materials.library import material_from_name
 from .findings import Finding, FindingCode
 from .label_model import DEEPEST, INHERENT, INHERENT_TRIED_MM_AL, LabelModel, measured_depth
 from .readings import FloatArray, Reading
@@ -35,9 +37,14 @@ def wrong_maps(judged: Sequence[Reading], maps: LabelModel) -> list[Finding]:
     """Scenes whose thickness maps do not fit the shadow in the frames: empty, another's, turned, or of another scale."""
     placements: dict[str, list[Reading]] = {}
     for item in judged:
-        if item.series.kind == "object" and maps.thickness(item.series.scene):
+        if item.series.kind == "object" and item.series.scene in maps.scenes:
             placements.setdefault(item.series.scene, []).append(item)
     found: list[Finding] = []
+    for scene in list(placements):
+        if text := _faulty(scene, maps):
+            found.append(_finding(placements.pop(scene), text))
+        elif not maps.thickness(scene):
+            del placements[scene]
     scales: dict[str, list[list[float]]] = {}
     inherent_mm_Al = _inherent_mm_Al([item for item in judged if item.series.kind == "flat"], maps)
     for scene, members in placements.items():
@@ -49,6 +56,21 @@ def wrong_maps(judged: Sequence[Reading], maps: LabelModel) -> list[Finding]:
             [value for item in members for value in _scales_of_map(item, maps, mm_Al)] for mm_Al in inherent_mm_Al
         ]
     return found + _scaled(scales, placements)
+
+
+def _faulty(scene: str, maps: LabelModel) -> str:
+    """What of a scene's maps is no path length through a known material; empty where all is."""
+    thickness_mm = maps.scenes[scene].thickness_mm
+    for material in thickness_mm:
+        try:
+            thickness_mm[material]
+        except FileFormatError as error:
+            return f"the thickness map of {material} in {scene} has {error.received}; expected {error.expected}"
+        try:
+            material_from_name(material)
+        except InputError:
+            return f"the thickness maps of {scene} are of {material!r}, which is no material of the library"
+    return ""
 
 
 def _finding(members: Sequence[Reading], what: str) -> Finding:

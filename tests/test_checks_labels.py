@@ -109,6 +109,11 @@ def maps(scene, change):
     return apply
 
 
+def of_material(file, name="unobtanium"):
+    group = file["scenes"]["product1"]["thickness_mm"]
+    group.move(next(iter(group)), name)
+
+
 def exchange_maps(file):
     file.move("scenes/product1/thickness_mm", "kept")
     file.move("scenes/product2/thickness_mm", "scenes/product1/thickness_mm")
@@ -254,6 +259,12 @@ def test_effects_at_the_end_of_their_range_are_not_taken_for_wrong_labels(tmp_pa
         (maps("product1", lambda image: 1.3 * image), None, "fit its frames only if all path lengths are 0.7"),
         (maps("product1", lambda image: 0 * image), None, "are empty, but its frames show a shadow"),
         (exchange_maps, None, "the maps of product2 would"),
+        (
+            maps("product1", lambda image: np.where(image > image.mean(), np.nan, image)),
+            None,
+            "has a negative or non-finite",
+        ),
+        (of_material, None, "of 'unobtanium', which is no material of the library"),
     ],
 )
 def test_wrong_label_is_found_and_named(changed, change, series, words):

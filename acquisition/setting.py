@@ -113,6 +113,15 @@ class Setting:
                 raise InputError(
                     name, received=f"{value} {unit}", expected=f"a finite value above 0 {unit}, at most {LARGEST:g}"
                 )
+        if isinstance(self.filters, str) or not (
+            isinstance(self.filters, Iterable) and all(isinstance(layer, Filter) for layer in self.filters)
+        ):
+            raise InputError(
+                "filters",
+                received=repr(self.filters),
+                expected='a tuple of filters, such as (Filter(material="Cu", thickness_mm=0.05),)',
+                remedy="settings as text take filter=Cu:0.05",
+            )
         for name in ("averaged", "binning"):
             check_number(name, getattr(self, name))
         if not 1 <= self.averaged <= LARGEST or self.averaged != int(self.averaged):

@@ -99,6 +99,12 @@ def test_a_setting_that_cannot_be_says_what_was_given_and_expected(text, message
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("filters", ["Cu:0.05", 5, ("Cu:0.05",), None])
+def test_the_filters_of_a_setting_are_filters(filters):
+    with pytest.raises(InputError, match=r"filters: got .*; expected a tuple of filters, such as"):
+        Setting(kV=40, exposure_ms=20, filters=filters)
+
+
 def test_a_filter_needs_a_name_that_the_grammar_can_hold():
     assert filter_from_text("Gd2O2S@7.32:0.2") == Filter(material="Gd2O2S@7.32", thickness_mm=0.2)
     with pytest.raises(InputError, match="filter material: got 'a,b'"):

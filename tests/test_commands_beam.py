@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
+import raytwin as rt
 from raytwin.cli import main
+from raytwin.errors import InputError
 
 PAIR = ["--low", "kv=40,power_w=40,exposure_ms=20", "--high", "kv=90,power_w=45,exposure_ms=20"]
 
@@ -123,3 +125,11 @@ def test_help_holds_an_example(capsys: pytest.CaptureFixture[str], command: str)
     with pytest.raises(SystemExit, match="0"):
         main([command, "--help"])
     assert f"example:\n  raytwin {command}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("given", [5, ["Al:1", 5], None, {"Al": 1.0}.values()])
+def test_layers_that_are_neither_texts_nor_filters_are_one_line(given) -> None:
+    with pytest.raises(InputError, match=r'filter: got .*; expected a text such as "Cu:0.1'):
+        rt.spectrum(kV=60, filter=given)
+    with pytest.raises(InputError, match=r'filter: got .*; expected a text such as "Cu:0.1'):
+        rt.mu("water", kV=60, cover=given)

@@ -215,7 +215,23 @@ def test_eight_bit_grey_and_grey_stored_as_colour_are_grey(tmp_path):
         ),
         (
             lambda root: (root / "raytwin.toml").write_text("[[series]]\nkind='flat'\nfiles='dark/*.tif'\nkV=-40\n"),
-            "attribute kV: got -40 kV; expected a finite number above 0 kV",
+            "import: error: raytwin.toml, series 1, kV: got -40 kV; expected a finite number above 0 kV",
+        ),
+        (
+            lambda root: (root / "raytwin.toml").write_text(
+                "[[series]]\nkind='dark'\nfiles='dark/*.tif'\nexposure_ms=-20\n"
+            ),
+            "import: error: raytwin.toml, series 1, exposure_ms: got -20 ms; expected a finite number of 0 or more ms",
+        ),
+        (
+            lambda root: (root / "raytwin.toml").write_text(SIDECAR.replace("size_mm = 3.5", "size_mm = -3.5")),
+            "import: error: raytwin.toml, scene 1, size_mm: got -3.5 mm",
+        ),
+        (
+            lambda root: (root / "raytwin.toml").write_text(
+                "[instrument]\npixel_mm = -1\n" + SIDECAR[SIDECAR.index("[[") :]
+            ),
+            "import: error: raytwin.toml, [instrument], instrument pixel_mm: got -1",
         ),
         (
             lambda root: (root / "raytwin.toml").write_text("[[series]]\nkind='flat'\nfor_each='no*'\nfiles='*'\n"),

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -349,10 +349,15 @@ def as_layers(value: Layers, library: Library) -> tuple[Filter, ...]:
     """Layers from texts or filters; each name is looked up, a NIST name with commas by its plain spelling.
 
     Raises:
-        InputError: a text that is no layer, or a material that nobody knows.
+        InputError: neither texts nor filters, a text that is no layer, or a material that nobody knows.
     """
     layers = []
-    for item in (value,) if isinstance(value, str | Filter) else value:
+    given = tuple(value) if isinstance(value, Iterable) and not isinstance(value, str) else (value,)
+    for item in given:
+        if not isinstance(item, str | Filter):
+            raise InputError(
+                "filter", received=repr(value), expected='a text such as "Cu:0.1+Al:1", a Filter, or a list of these'
+            )
         parts = (
             [item] if isinstance(item, Filter) else [part for part in item.split("+") if part.strip() or item.strip()]
         )

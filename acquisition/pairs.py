@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ._acquisition_words import text_from_shape
 from .acquisition_io import AcquisitionFile, Series
 from .contrast import DILATIONS, PRODUCT_THRESHOLD, check_dilations, delta_r
 from .dataset_io import DatasetRow, write_dataset
@@ -60,9 +61,14 @@ def replace_bad_pixels(image: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[A
         InputError: shapes that differ, or no good pixel at all.
     """
     if image.shape[-2:] != bad.shape:
-        raise InputError("bad-pixel mask", received=f"shape {bad.shape}", expected=f"shape {image.shape[-2:]}")
+        raise InputError(
+            "map of bad pixels",
+            received=f"{text_from_shape(bad.shape)} pixels",
+            expected=f"{text_from_shape(image.shape[-2:])} pixels as in the images",
+            remedy="give the map, or the twin that holds it, of the detector that took these images",
+        )
     if bool(bad.all()):
-        raise InputError("bad-pixel mask", received="every pixel bad", expected="at least one good pixel")
+        raise InputError("map of bad pixels", received="every pixel bad", expected="at least one good pixel")
     repaired = np.array(image, dtype=np.result_type(image.dtype, np.float32))
     rows, columns = bad.shape
     for row, column in np.argwhere(bad):

@@ -117,6 +117,7 @@ def test_a_truncated_twin(files, tmp_path, capsys, keep):
     broken = damaged(files["twin"], tmp_path, keep)
     refused(capsys, tmp_path, ["predict", broken, "--kv", 60, *PREDICT, "--json"], mentions="damaged.h5")
     refused(capsys, tmp_path, ["validate", broken, files["session"], "--json"], mentions="damaged.h5")
+    refused(capsys, tmp_path, ["report", broken, "-o", tmp_path / "a.html"], mentions="the file of a twin, a dataset")
 
 
 def test_a_file_that_is_not_there(files, tmp_path, capsys):

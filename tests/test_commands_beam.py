@@ -92,7 +92,9 @@ def test_own_materials_and_a_measured_spectrum_take_part(json_of, tmp_path: Path
         (["spectrum", "--kv", "60", "--filter", "Cu"], "filter: got 'Cu'; expected MATERIAL:mm"),
         (["spectrum", "--kv", "60", "--filter", "Cu:-1"], "thickness of filter Cu: got -1.0 mm"),
         (["spectrum", "--kv", "60", "--model", "default"], "model: got 'default'"),
-        (["spectrum", "--kv", "sixty"], "argument --kv: invalid float value: 'sixty'"),
+        (["spectrum", "--kv", "sixty"], "argument --kv: got 'sixty'; expected a number"),
+        (["spectrum", "--kv", "60kV"], "argument --kv: got '60kV'; expected a number, without its unit"),
+        (["lab", "-o", "x.h5", "--protocol", "full", "--seed", "one"], "--seed: got 'one'; expected a whole number"),
         (["spectrum", "--spectrum-file", "missing.txt"], "spectrum file: got missing.txt; expected a readable file"),
         (["contrast", "--product", "water:9", "--object", "Al", *PAIR], "--object: got 'Al'; expected MATERIAL:mm"),
         (["contrast", "--product", "musle:9", "--object", "Al:1", *PAIR], "--product: got 'musle'"),
@@ -125,6 +127,10 @@ def test_help_holds_an_example(capsys: pytest.CaptureFixture[str], command: str)
     with pytest.raises(SystemExit, match="0"):
         main([command, "--help"])
     assert f"example:\n  raytwin {command}" in capsys.readouterr().out
+
+
+def test_attenuation_through_a_twin_in_memory_says_of_what() -> None:
+    assert rt.mu("water", kV=60, twin=rt.read_twin("virtual_lab")).where == "60 kV of a twin in memory"
 
 
 @pytest.mark.parametrize("given", [5, ["Al:1", 5], None, {"Al": 1.0}.values()])

@@ -598,7 +598,7 @@ def _mu_of_twin(
 
 
 def _name_of(twin: Any) -> str:
-    return str(twin) if isinstance(twin, str | os.PathLike) else "in memory"
+    return str(twin) if isinstance(twin, str | os.PathLike) else "a twin in memory"
 
 
 def mu(
@@ -788,7 +788,7 @@ def contrast(
         if not 1 <= len(values) <= MOST_VALUES:
             raise InputError(f"map, {name}", received=f"{len(values)} values", expected=f"1 to {MOST_VALUES}")
     source = _line_of(twin, line)
-    told = str(twin) if isinstance(twin, str | os.PathLike) else None if twin is None else "in memory"
+    told = None if twin is None else _name_of(twin)
     words: dict[str, Any] = {"product": slabs[0], "foreign_object": slabs[1], "displaces": displaces}
     if not axes:
         found = predict_contrast(source, low=pair[0], high=pair[1], object_pixels=object_pixels, **words)

@@ -109,13 +109,15 @@ class Setting:
             value = getattr(self, name)
             if value is not None:
                 check_number(name, value, unit=unit)
-            if value is not None and not 0 < value <= LARGEST:
+            # squares and reciprocals of these numbers are taken
+            if value is not None and not 1.0 / LARGEST <= value <= LARGEST:
                 raise InputError(
-                    name, received=f"{value} {unit}", expected=f"a finite value above 0 {unit}, at most {LARGEST:g}"
+                    name,
+                    received=f"{value} {unit}",
+                    expected=f"a finite value above 0 {unit}, {1.0 / LARGEST:g} to {LARGEST:g}",
                 )
-        if isinstance(self.filters, str) or not (
-            isinstance(self.filters, Iterable) and all(isinstance(layer, Filter) for layer in self.filters)
-        ):
+        filters: object = self.filters
+        if not (isinstance(filters, tuple | list) and all(isinstance(layer, Filter) for layer in filters)):
             raise InputError(
                 "filters",
                 received=repr(self.filters),

@@ -71,13 +71,13 @@ def add_setting(
         if new:
             _write(file, read_utf8(file).rstrip("\n") + "\n\n" + _setting_text(pair))
         slabs = campaign.slabs
-        named = None if slabs is None else (slabs.product.material, slabs.foreign_object.material)
+        theirs = None if slabs is None else (slabs.product.material, slabs.foreign_object.material)
         return AddedSetting(
             path=file,
             settings=len(campaign.settings) + new,
             new=new,
             description=None,
-            other_materials=None if named == (product.material, foreign_object.material) else named,
+            other_materials=None if theirs == (product.material, foreign_object.material) else theirs,
         )
     description = None
     if references is None:

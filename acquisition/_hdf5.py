@@ -33,6 +33,13 @@ HDF5_ERRORS = (
 # what viewers (h5web, silx) look at to show a file's arrays as pictures: words of NeXus, no measurements
 NEXUS_WORDS = frozenset({"NX_class", "default", "signal", "axes", "auxiliary_signals", "interpretation"})
 
+# raytwin's own files by their format: what each is, and the commands that make one
+_KINDS_OF_FILES = {
+    "raytwin-acquisition": ("an acquisition, frames of a session", "`raytwin import` and `raytwin lab`"),
+    "raytwin-dataset": ("a dataset of image pairs", "`raytwin import reference` and `raytwin generate`"),
+    "raytwin-twin": ("a twin", "`raytwin calibrate` and `raytwin diagnose`"),
+}
+
 # a dataset; HDF5 2 would keep 8 MiB of each, and frames are read once and in whole chunks
 _CHUNK_CACHE_BYTES = 2**20
 # of processor time, for what takes microseconds: a heap of texts whose sizes are 0 is read for ever
@@ -87,23 +94,23 @@ def _reason(error: BaseException) -> str:
     return text[start + 1 : end] if 0 <= start < end else text
 
 
-def check_format(file: Any, *, path: str, format_name: str, version: int) -> None:
-    """Check the root attributes `format` and `version`."""
+def check_format(
+    file: Any, *, path: str, format_name: str, version: int, remedy: str = "use a raytwin that knows this version"
+) -> None:
+    """Check the root attributes `format` and `version`; remedy: what to do about another version."""
     found = text_attribute(file, "format", where=path)
     if found != format_name:
+        kind, maker = _KINDS_OF_FILES[format_name]
+        received = "an HDF5 file without a `format` attribute" if found is None else f"format {found!r}"
+        if found in _KINDS_OF_FILES:
+            received = f"{_KINDS_OF_FILES[found][0]} ({received})"
         raise FileFormatError(
-            path,
-            received="an HDF5 file without a `format` attribute" if found is None else f"format {found!r}",
-            expected=f"format {format_name!r}",
-            remedy="other layouts are read by `raytwin import`",
+            path, received=received, expected=f"{kind} (format {format_name!r})", remedy=f"{maker} make one"
         )
     found_version = whole_attribute(file, "version", where=path)
     if found_version != version:
         raise FileFormatError(
-            path,
-            received=f"{format_name} version {found_version}",
-            expected=f"version {version}",
-            remedy="use a raytwin that knows this version",
+            path, received=f"{format_name} version {found_version}", expected=f"version {version}", remedy=remedy
         )
 
 
@@ -126,6 +133,17 @@ def number_attribute(
     value = _attribute(node, name, where=where)
     if value is None:
         return None
+    return checked_number(value, where=f"{where}, attribute {name}", lowest=lowest, above=above, unit=unit)
+
+
+def checked_number(
+    value: Any, *, where: str, lowest: float | None = None, above: float | None = None, unit: str = ""
+) -> float:
+    """A finite number; `lowest` may be reached, `above` may not.
+
+    Raises:
+        FileFormatError: another value, which stands at `where`.
+    """
     expected = "a finite number"
     if above is not None:
         expected += f" above {above:g}"
@@ -134,17 +152,13 @@ def number_attribute(
     try:
         number = float(value)
     except (TypeError, ValueError):
-        raise FileFormatError(
-            f"{where}, attribute {name}", received=repr(value), expected=f"{expected} {unit}".rstrip()
-        ) from None
+        raise FileFormatError(where, received=repr(value), expected=f"{expected} {unit}".rstrip()) from None
     too_low = (lowest is not None and number < lowest) or (above is not None and number <= above)
     too_high = abs(number) > LARGEST
     if too_high and math.isfinite(number):
         expected += f", at most {LARGEST:g}"
     if not math.isfinite(number) or too_low or too_high:
-        raise FileFormatError(
-            f"{where}, attribute {name}", received=f"{number:g} {unit}".rstrip(), expected=f"{expected} {unit}".rstrip()
-        )
+        raise FileFormatError(where, received=f"{number:g} {unit}".rstrip(), expected=f"{expected} {unit}".rstrip())
     return number
 
 

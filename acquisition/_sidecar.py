@@ -12,6 +12,7 @@ from typing import Any
 
 from ..errors import FileFormatError, InputError
 from ..files import CSV_UTF8, read_utf8
+from ._hdf5 import named
 from ._image_files import RawLayout, natural_key
 from .instrument import BOOLEAN_FIELDS, LAYER_FIELDS, TEXT_FIELDS, WHOLE_FIELDS, Instrument
 from .setting import filters_from_text
@@ -116,7 +117,8 @@ def instrument_of(tables: Mapping[str, Any], *, where: str) -> Instrument:
             values[word] = value
         else:
             values[word] = number_of(table, word, where=where)
-    return Instrument(**values)
+    with named(where, InputError):
+        return Instrument(**values)
 
 
 def raw_layout_of(tables: Mapping[str, Any], *, where: str) -> RawLayout | None:

@@ -14,7 +14,17 @@ from numpy.typing import NDArray
 from ..errors import FileFormatError
 from ..files import whole_file
 from ..results import Table, counted
-from ._acquisition_words import CORRECTIONS, ERROR, FORMAT, KINDS, PANEL_LAYERS, ROLES, VERSION, text_from_shape
+from ._acquisition_words import (
+    CORRECTIONS,
+    ERROR,
+    FORMAT,
+    KINDS,
+    PANEL_LAYERS,
+    ROLES,
+    VERSION,
+    bounds_of,
+    text_from_shape,
+)
 from ._hdf5 import (
     check_format,
     check_open,
@@ -352,23 +362,17 @@ def _series(group: Any, name: str, *, path: str) -> Series:
     kind = _one_of(node, "kind", KINDS, where=where)
     if kind is None:
         raise FileFormatError(f"{where}, attribute kind", received="nothing", expected="one of " + ", ".join(KINDS))
-    dark = kind in ("dark", "afterglow")
 
-    def positive(attribute: str, unit: str) -> float | None:
-        return number_attribute(node, attribute, where=where, above=0, unit=unit)
+    def number(attribute: str) -> float | None:
+        return number_attribute(node, attribute, where=where, **bounds_of(attribute, kind))
 
-    def load(attribute: str, unit: str) -> float | None:
-        # With the beam off, 0 kV, 0 mA or 0 W is how some systems write "no beam".
-        if not dark:
-            return positive(attribute, unit)
-        return number_attribute(node, attribute, where=where, lowest=0, unit=unit) or None
+    def whole(attribute: str) -> int | None:
+        return whole_attribute(node, attribute, where=where, **bounds_of(attribute, kind))
 
-    kV, current_mA, power_W = load("kV", "kV"), load("current_mA", "mA"), load("power_W", "W")
-    # 0 ms: shorter than the clock tells, or the light is pulsed; there is then no load and no setting
-    exposure_ms = number_attribute(node, "exposure_ms", where=where, lowest=0, unit="ms")
+    kV, current_mA, power_W = (number(load) or None for load in ("kV", "current_mA", "power_W"))
+    exposure_ms, source_detector_mm = number("exposure_ms"), number("source_detector_mm")
     filters = filters_attribute(node, "filter", where=where) or ()
-    averaged = whole_attribute(node, "averaged", where=where, lowest=1) or 1
-    source_detector_mm = positive("source_detector_mm", "mm")
+    averaged = whole("averaged") or 1
     setting = None
     if kV is not None and exposure_ms:
         with named(where):
@@ -380,12 +384,12 @@ def _series(group: Any, name: str, *, path: str) -> Series:
                 filters=filters,
                 averaged=averaged,
                 source_detector_mm=source_detector_mm,
-                binning=whole_attribute(node, "binning", where=where, lowest=1) or 1,
+                binning=whole("binning") or 1,
             )
     corrected = _corrections(node, where=where)
     role = _one_of(node, "role", ROLES, where=where)
     layer = _one_of(node, "layer", PANEL_LAYERS, where=where)
-    index = whole_attribute(node, "index", where=where, lowest=0)
+    index = whole("index")
     return Series(
         name=name,
         index=-1 if index is None else index,
@@ -396,12 +400,12 @@ def _series(group: Any, name: str, *, path: str) -> Series:
         power_W=power_W,
         filters=filters,
         averaged=averaged,
-        frame_interval_ms=positive("frame_interval_ms", "ms"),
-        belt_speed_mm_s=number_attribute(node, "belt_speed_mm_s", where=where, unit="mm/s"),
-        panel_rotation_deg=number_attribute(node, "panel_rotation_deg", where=where, unit="degrees") or 0.0,
-        source_object_mm=positive("source_object_mm", "mm"),
+        frame_interval_ms=number("frame_interval_ms"),
+        belt_speed_mm_s=number("belt_speed_mm_s"),
+        panel_rotation_deg=number("panel_rotation_deg") or 0.0,
+        source_object_mm=number("source_object_mm"),
         source_detector_mm=source_detector_mm,
-        photons_per_pixel=number_attribute(node, "photons_per_pixel", where=where, lowest=0),
+        photons_per_pixel=number("photons_per_pixel"),
         scene=text_attribute(node, "scene", where=where) or "",
         corrected=corrected,
         role=role,

@@ -272,13 +272,19 @@ def read_dataset(path: str | os.PathLike[str]) -> Dataset:
         raise
 
 
+def _shape_of(dataset: Any) -> str:
+    """For messages."""
+    shape = getattr(dataset, "shape", None)
+    return "no such array" if shape is None else f"shape {shape}"
+
+
 def _dataset(file: Any, *, path: str) -> Dataset:
     check_format(file, path=path, format_name=FORMAT, version=VERSION)
     images = child(file, "images")
     if not isinstance(images, h5py.Dataset) or images.ndim != 4 or images.shape[1] != 2 or 0 in images.shape:
         raise FileFormatError(
             f"{path}, images",
-            received=f"shape {getattr(images, 'shape', 'absent')}",
+            received=_shape_of(images),
             expected="at least one image pair, (n, 2, row, column)",
         )
     n, _, row, column = (int(length) for length in images.shape)
@@ -291,9 +297,7 @@ def _dataset(file: Any, *, path: str) -> Dataset:
         if dataset is None and name == "counts":
             continue
         if not isinstance(dataset, h5py.Dataset) or dataset.shape != shape:
-            raise FileFormatError(
-                f"{path}, {name}", received=f"shape {getattr(dataset, 'shape', 'absent')}", expected=f"shape {shape}"
-            )
+            raise FileFormatError(f"{path}, {name}", received=_shape_of(dataset), expected=f"shape {shape}")
     for name in ("images", "counts", "foreign_object_masks", "product_masks"):
         if name in file:
             check_stored(file[name], where=f"{path}, {name}")
@@ -318,9 +322,7 @@ def _rows(group: Any, *, n: int, path: str) -> tuple[DatasetRow, ...]:
                 raise FileFormatError(where, received="nothing", expected=f"{n} values, one an image")
             continue
         if not isinstance(dataset, h5py.Dataset) or dataset.shape != (n,):
-            raise FileFormatError(
-                where, received=f"shape {getattr(dataset, 'shape', 'absent')}", expected=f"{n} values, one an image"
-            )
+            raise FileFormatError(where, received=_shape_of(dataset), expected=f"{n} values, one an image")
         with reading(where):
             if name in _NUMBERS:
                 if dataset.dtype.kind not in "iuf":

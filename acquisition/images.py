@@ -53,6 +53,7 @@ What the sidecar leaves open is taken from the headers of DICOM, HIS and EDF fil
 ImageJ files; where both state it, the sidecar counts and the difference is told.
 """
 
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext, suppress
@@ -62,7 +63,8 @@ from typing import Any
 
 from ..errors import FileFormatError, InputError
 from ..results import counted
-from ._hdf5 import named
+from ._acquisition_words import bounds_of
+from ._hdf5 import checked_number, named
 from ._image_files import (
     IMAGE_ENDINGS,
     TIFF_ENDINGS,
@@ -347,10 +349,13 @@ def _write_series(
 ) -> dict[str, Any]:
     table, where, files = plan.table, plan.where, plan.files
     setting_text = text_of(table, "setting", where=where)
+    kind = text_of(table, "kind", where=where) or ""
     attributes: dict[str, Any] = {word: number_of(table, word, where=where) for word in (*_NUMBERS, *_WHOLE)}
-    for word in _WHOLE:
-        if isinstance(attributes[word], float):
-            raise InputError(f"{where}, {word}", received=attributes[word], expected="a whole number")
+    for word, value in attributes.items():
+        if word in _WHOLE and isinstance(value, float):
+            raise InputError(f"{where}, {word}", received=value, expected="a whole number")
+        if value is not None:
+            checked_number(value, where=f"{where}, {word}", **bounds_of(word, kind))
     filter_text = text_of(table, "filter", where=where)
     if filter_text is not None:
         attributes["filters"] = filters_from_text(filter_text)
@@ -375,7 +380,7 @@ def _write_series(
                 with named(where, InputError):
                     series = writer.add_series(
                         plan.name,
-                        kind=text_of(table, "kind", where=where) or "",
+                        kind=kind,
                         shape=shape,
                         dtype=text_of(table, "dtype", where=where) or frame_dtype(image),
                         setting=setting,
@@ -437,6 +442,8 @@ def _write_scene(
     size_mm = number_of(table, "size_mm", where=where)
     if "size_mm" in known:
         size_mm = number_in_cell(known["size_mm"], where=f"{where}, size_mm")
+    if size_mm is not None and not math.isnan(size_mm):
+        checked_number(size_mm, where=f"{where}, size_mm", lowest=0, unit="mm")
     writer.add_scene(
         name,
         kind=text_of(table, "kind", where=where) or "product",

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ._acquisition_words import text_from_shape
 from .acquisition_io import AcquisitionFile, Series
 from .contrast import DILATIONS, PRODUCT_THRESHOLD, check_dilations, delta_r
 from .dataset_io import DatasetRow, write_dataset
@@ -60,9 +61,14 @@ def replace_bad_pixels(image: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[A
         InputError: shapes that differ, or no good pixel at all.
     """
     if image.shape[-2:] != bad.shape:
-        raise InputError("bad-pixel mask", received=f"shape {bad.shape}", expected=f"shape {image.shape[-2:]}")
+        raise InputError(
+            "map of bad pixels",
+            received=f"{text_from_shape(bad.shape)} pixels",
+            expected=f"{text_from_shape(image.shape[-2:])} pixels as in the images",
+            remedy="give the map, or the twin that holds it, of the detector that took these images",
+        )
     if bool(bad.all()):
-        raise InputError("bad-pixel mask", received="every pixel bad", expected="at least one good pixel")
+        raise InputError("map of bad pixels", received="every pixel bad", expected="at least one good pixel")
     repaired = np.array(image, dtype=np.result_type(image.dtype, np.float32))
     rows, columns = bad.shape
     for row, column in np.argwhere(bad):
@@ -352,7 +358,7 @@ def dataset_from_acquisition(
         acquisition: open acquisition file with objects, and darks and flats at their settings.
         out: dataset file to write.
         low, high: settings of the pair; None where the acquisition holds one pair of settings only. Tube current,
-            power and distance are compared only where they are given, filters where that leaves a pair.
+            power and distance are compared only where they are given, averaging and filters where that leaves a pair.
         with_counts: keep the raw frames (DN, dark included) beside the log images.
         split: one split for all, or scene -> split; None takes the scene's attribute `split`, else `test`.
         each_frame: every frame makes an image of its own; otherwise the frames of a series are averaged.
@@ -382,7 +388,8 @@ def dataset_from_acquisition(
         there = kinds or sorted({_text(pair) for pair in pairs})
         raise InputError(
             "setting pair",
-            received=f"{len(kinds)} that fit" + ("" if low or high else " (none was chosen)"),
+            received=(f"{len(kinds)} that fit" if kinds else _no_fit(pairs, low, high))
+            + ("" if low or high else " (none was chosen)"),
             expected="one of " + " | ".join(there),
             remedy="choose one with low and high",
         )
@@ -506,32 +513,47 @@ def _reference(pairs: Sequence[ObjectPair], pair: ObjectPair) -> ObjectPair:
 
 
 def _choose(pairs: Sequence[ObjectPair], low: Setting | None, high: Setting | None) -> list[ObjectPair]:
-    """The pairs at the settings asked for; filters need not be named where nothing fits without them."""
-    for any_filter in (False, True):
-        found = [
-            pair
-            for pair in pairs
-            if _fits(low, pair.low.setting, any_filter=any_filter)
-            and _fits(high, pair.high.setting, any_filter=any_filter)
-        ]
+    """The pairs at the settings asked for; averaging and filters need not be named where nothing fits without them."""
+    for unnamed in ((), ("averaged",), ("filter",), ("averaged", "filter")):
+        found = [pair for pair in pairs if not any(_misfits(pair, low, high, unnamed=unnamed))]
         if found:
             return found
     return []
 
 
-def _fits(wanted: Setting | None, setting: Setting | None, *, any_filter: bool) -> bool:
-    if wanted is None:
-        return True
-    if setting is None:
-        return False
-    return (
-        _same(wanted.kV, setting.kV)
-        and _same(wanted.exposure_ms, setting.exposure_ms)
-        and wanted.averaged == setting.averaged
-        and (wanted.filters == setting.filters or (any_filter and not wanted.filters))
-        and (wanted.tube_current_mA is None or _same_load(wanted, setting))
-        and (wanted.source_detector_mm is None or _same(wanted.source_detector_mm, setting.source_detector_mm))
+def _misfits(
+    pair: ObjectPair, low: Setting | None, high: Setting | None, *, unnamed: Sequence[str] = ("averaged", "filter")
+) -> tuple[list[str], list[str]]:
+    """Words of the settings asked for that a pair does not have, of low and of high; unnamed: words that may be left out."""
+    first, second = (
+        [] if wanted is None else _differing(wanted, there, unnamed)
+        for wanted, there in zip((low, high), (pair.low.setting, pair.high.setting), strict=True)
     )
+    return first, second
+
+
+def _differing(wanted: Setting, there: Setting | None, unnamed: Sequence[str]) -> list[str]:
+    if there is None:
+        return ["kv"]
+    fits = {
+        "kv": _same(wanted.kV, there.kV),
+        "current_ma or power_w": wanted.tube_current_mA is None or _same_load(wanted, there),
+        "exposure_ms": _same(wanted.exposure_ms, there.exposure_ms),
+        "filter": wanted.filters == there.filters or ("filter" in unnamed and not wanted.filters),
+        "averaged": wanted.averaged == there.averaged or ("averaged" in unnamed and wanted.averaged == 1),
+        "source_detector_mm": wanted.source_detector_mm is None
+        or _same(wanted.source_detector_mm, there.source_detector_mm),
+    }
+    return [word for word, fit in fits.items() if not fit]
+
+
+def _no_fit(pairs: Sequence[ObjectPair], low: Setting | None, high: Setting | None) -> str:
+    """What no pair has of the settings asked for: the words of the pair that is nearest."""
+    nearest = min((_misfits(pair, low, high) for pair in pairs), key=lambda words: sum(map(len, words)))
+    told = "; ".join(
+        f"{', '.join(words)} of {side}" for side, words in zip(("low", "high"), nearest, strict=True) if words
+    )
+    return f"settings that no pair has (the nearest differs in {told})"
 
 
 def _text(pair: ObjectPair, *, frames: tuple[int, int] = (1, 1)) -> str:

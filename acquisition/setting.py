@@ -109,10 +109,21 @@ class Setting:
             value = getattr(self, name)
             if value is not None:
                 check_number(name, value, unit=unit)
-            if value is not None and not 0 < value <= LARGEST:
+            # squares and reciprocals of these numbers are taken
+            if value is not None and not 1.0 / LARGEST <= value <= LARGEST:
                 raise InputError(
-                    name, received=f"{value} {unit}", expected=f"a finite value above 0 {unit}, at most {LARGEST:g}"
+                    name,
+                    received=f"{value} {unit}",
+                    expected=f"a finite value above 0 {unit}, {1.0 / LARGEST:g} to {LARGEST:g}",
                 )
+        filters: object = self.filters
+        if not (isinstance(filters, tuple | list) and all(isinstance(layer, Filter) for layer in filters)):
+            raise InputError(
+                "filters",
+                received=repr(self.filters),
+                expected='a tuple of filters, such as (Filter(material="Cu", thickness_mm=0.05),)',
+                remedy="settings as text take filter=Cu:0.05",
+            )
         for name in ("averaged", "binning"):
             check_number(name, getattr(self, name))
         if not 1 <= self.averaged <= LARGEST or self.averaged != int(self.averaged):

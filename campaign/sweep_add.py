@@ -19,12 +19,14 @@ _OBJECT_SHARE = (0.5, 1.5)  # of the object that was asked for
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AddedSetting:
-    """What was done: the campaign file, its settings by now, whether the pair is new in it, and a description that was written."""
+    """What was done: the campaign file, its settings by now, whether the pair is new in it, a description that was written, and
+    product and foreign object of the campaign's `[contrast]` where their materials are others (None: they are the same)."""
 
     path: Path
     settings: int
     new: bool
     description: Path | None
+    other_materials: tuple[str, str] | None = None
 
 
 def add_setting(
@@ -44,7 +46,8 @@ def add_setting(
     """Add a pair of settings to a campaign file, which is made where it is not there.
 
     A new file names the twin, the references and the slabs of `[contrast]`. Without references a description is written beside
-    it: blocks of the product that hold lying discs of the foreign object. A file that is there keeps its text.
+    it: blocks of the product that hold lying discs of the foreign object. A file that is there keeps its text,
+    with the products and objects that it is of.
 
     Args:
         path: the campaign file (.toml).
@@ -64,11 +67,18 @@ def add_setting(
     pair = (low, high)
     if file.exists():
         campaign = read_campaign(file)
-        if text_of_pair(pair) in map(text_of_pair, campaign.settings):
-            return AddedSetting(path=file, settings=len(campaign.settings), new=False, description=None)
-        text = read_utf8(file).rstrip("\n") + "\n\n" + _setting_text(pair)
-        _write(file, text)
-        return AddedSetting(path=file, settings=len(campaign.settings) + 1, new=True, description=None)
+        new = text_of_pair(pair) not in map(text_of_pair, campaign.settings)
+        if new:
+            _write(file, read_utf8(file).rstrip("\n") + "\n\n" + _setting_text(pair))
+        slabs = campaign.slabs
+        theirs = None if slabs is None else (slabs.product.material, slabs.foreign_object.material)
+        return AddedSetting(
+            path=file,
+            settings=len(campaign.settings) + new,
+            new=new,
+            description=None,
+            other_materials=None if theirs == (product.material, foreign_object.material) else theirs,
+        )
     description = None
     if references is None:
         description = file.with_name(f"{file.stem}_scene.toml")

@@ -28,6 +28,10 @@ class Asked:
     strength: float
     since: str | None = None
 
+    def __str__(self) -> str:
+        """As `--effect` takes it."""
+        return f"{self.id}={self.strength:g}" + (f"@{self.since}" if self.since else "")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Site:

@@ -490,8 +490,8 @@ def run_protocol(
     _only_in(
         "a long session (full, short or products)",
         geometry=geometry,
-        effects=effects or None,
-        leave_out=leave_out or None,
+        effects=tuple(effects) or None,
+        leave_out=tuple(leave_out) or None,
         only=only,
     )
     if system is None:
@@ -539,7 +539,8 @@ def run_protocol(
 def _only_in(place: str, **given: object) -> None:
     for name, value in given.items():
         if value is not None:
-            raise InputError(name, received=value, expected=f"nothing: it belongs to {place}")
+            received = ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
+            raise InputError(name, received=received, expected=f"nothing: it belongs to {place}")
 
 
 def _run_session(

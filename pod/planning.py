@@ -38,7 +38,7 @@ _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AssumedCurve:
-    """What one expects to find: averaged a50 and a90 (any unit), link, spread of networks and images on eta's scale."""
+    """What one expects to find: averaged a50 and a90 (any unit, above 0), link, spread of networks and images on eta's scale."""
 
     a50: float
     a90: float
@@ -51,10 +51,12 @@ class AssumedCurve:
         link_from_name(self.link)
         for name in ("a50", "a90", "sd_network", "sd_image"):
             check_number(name, getattr(self, name))
-        if not (math.isfinite(self.a50) and math.isfinite(self.a90) and self.a90 > self.a50):
-            raise InputError("a50 and a90", received=f"{self.a50:g} and {self.a90:g}", expected="an a90 above the a50")
-        if self.log_size and not self.a50 > 0:
-            raise InputError("a50", received=self.a50, expected="a size above 0 on log size")
+        if not 0.0 < self.a50 < self.a90 < math.inf:
+            raise InputError(
+                "a50 and a90",
+                received=f"{self.a50:g} and {self.a90:g}",
+                expected="finite sizes above 0, the a90 above the a50",
+            )
         for name in ("sd_network", "sd_image"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
@@ -133,7 +135,7 @@ def recommended_sizes(curve: AssumedCurve, images: int, *, networks: int = 1) ->
     for low in (0.02, 0.05, 0.1, 0.2, 0.3):
         for high in (0.95, 0.97, 0.99, 0.995):
             ends = curve.size_at(low), curve.size_at(high)
-            if ends[0] <= 0 and curve.a50 > 0:
+            if ends[0] <= 0:
                 ends = max(ends[0], 0.02 * curve.a50), ends[1]
             sizes = np.geomspace(*ends, images) if curve.log_size else np.linspace(*ends, images)
             spread = expected_precision(curve, sizes, networks=networks).sd_a90

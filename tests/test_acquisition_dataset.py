@@ -153,8 +153,11 @@ def test_datasets_of_different_shapes_are_not_joined(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda f: f.attrs.__setitem__("format", "raytwin-acquisition"), "expected format 'raytwin-dataset'"),
-        (lambda f: f.__delitem__("images"), "images: got shape absent"),
+        (
+            lambda f: f.attrs.__setitem__("format", "raytwin-acquisition"),
+            "got an acquisition, frames of a session (format",
+        ),
+        (lambda f: f.__delitem__("images"), "images: got no such array"),
         (lambda f: f.__delitem__("rows"), "rows: got nothing"),
         (lambda f: f["rows"].__delitem__("split"), "rows/split: got nothing; expected 5 values"),
         (lambda f: (f["rows"].__delitem__("image"), f["rows"].create_dataset("image", data=[1, 2])), "got shape (2,)"),
@@ -170,7 +173,7 @@ def test_datasets_of_different_shapes_are_not_joined(tmp_path):
             lambda f: (f.__delitem__("product_masks"), f.create_dataset("product_masks", data=np.zeros((5, 2, 2)))),
             "product_masks: got shape (5, 2, 2); expected shape (5, 6, 7)",
         ),
-        (lambda f: f.__delitem__("foreign_object_masks"), "foreign_object_masks: got shape absent"),
+        (lambda f: f.__delitem__("foreign_object_masks"), "foreign_object_masks: got no such array"),
     ],
 )
 def test_a_file_that_is_no_dataset_says_where(path, change, message):

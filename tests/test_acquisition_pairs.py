@@ -1,5 +1,7 @@
 """From object series to a dataset: correction in closed form, pairing by scene, contrasts of the low-noise pair."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -127,7 +129,7 @@ def test_bad_pixels_are_replaced_in_every_frame_and_nothing_else_changes():
         np.testing.assert_array_equal(replace_bad_pixels(frame, bad), whole)
     with pytest.raises(InputError, match="every pixel bad"):
         replace_bad_pixels(frames, np.ones((8, 9), bool))
-    with pytest.raises(InputError, match=r"bad-pixel mask: got shape \(3, 3\)"):
+    with pytest.raises(InputError, match=r"map of bad pixels: got 3 x 3 pixels"):
         replace_bad_pixels(frames, np.ones((3, 3), bool))
 
 
@@ -247,9 +249,28 @@ def test_a_setting_is_chosen_without_naming_its_filter_where_only_one_fits(tmp_p
             InputError, match=r"setting pair: got 2 that fit \(none was chosen\); expected one of kv=40"
         ):
             dataset_from_acquisition(acquisition, tmp_path / "e.h5")
-        with pytest.raises(InputError, match="setting pair: got 0 that fit"):
+        with pytest.raises(
+            InputError, match=r"nearest differs in kv, current_ma or power_w of low\); expected one of kv=40"
+        ):
             dataset_from_acquisition(acquisition, tmp_path / "e.h5", low=HIGH)
     assert not (tmp_path / "e.h5").exists()
+
+
+def test_a_setting_is_chosen_without_naming_how_many_were_averaged(tmp_path):
+    write(tmp_path / "a.h5", exposures=((20, 1), (100, 10)))
+    wanted = [setting_from_text(f"kv={kv},exposure_ms=100") for kv in (40, 90)]
+    with open_acquisition(tmp_path / "a.h5") as acquisition:
+        found = dataset_from_acquisition(acquisition, tmp_path / "d.h5", low=wanted[0], high=wanted[1])
+        with pytest.raises(InputError, match=r"nearest differs in averaged of low; exposure_ms of high\)"):
+            dataset_from_acquisition(
+                acquisition,
+                tmp_path / "e.h5",
+                low=replace(wanted[0], averaged=5),
+                high=replace(wanted[1], exposure_ms=90),
+            )
+    assert found.images == 3
+    # two frames, each the mean of ten
+    assert [setting_from_text(text.split(";")[0]) for text in found.settings] == [at(LOW, 100, 20)]
 
 
 def test_without_dark_flat_or_mask_the_message_says_what_to_measure(tmp_path):

@@ -83,7 +83,11 @@ def test_load_is_power_over_voltage_times_time():
         ("kv=forty,exposure_ms=20", "setting, kv: got 'forty'; expected a number"),
         ("kv=40,exposure_ms=-20", "exposure_ms: got -20.0 ms; expected a finite value above 0 ms"),
         ("kv=nan,exposure_ms=20", "kV: got nan kV"),
-        ("kv=40,exposure_ms=1e300", "exposure_ms: got 1e+300 ms; expected a finite value above 0 ms, at most 1e+12"),
+        ("kv=40,exposure_ms=1e300", "exposure_ms: got 1e+300 ms; expected a finite value above 0 ms, 1e-12 to 1e+12"),
+        (
+            "kv=40,exposure_ms=20,source_detector_mm=1e-200",
+            "source_detector_mm: got 1e-200 mm; expected a finite value",
+        ),
         ("kv=40,exposure_ms=20,filter=Cu", "filter: got 'Cu'; expected MATERIAL:mm"),
         ("kv=40,exposure_ms=20,filter=Cu:-1", "thickness of filter Cu: got -1.0 mm"),
         ("kv=40,exposure_ms=20,averaged=0", "averaged: got 0; expected a whole number of frames"),
@@ -97,6 +101,12 @@ def test_a_setting_that_cannot_be_says_what_was_given_and_expected(text, message
         setting_from_text(text)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("filters", ["Cu:0.05", 5, ("Cu:0.05",), None])
+def test_the_filters_of_a_setting_are_filters(filters):
+    with pytest.raises(InputError, match=r"filters: got .*; expected a tuple of filters, such as"):
+        Setting(kV=40, exposure_ms=20, filters=filters)
 
 
 def test_a_filter_needs_a_name_that_the_grammar_can_hold():

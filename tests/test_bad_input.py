@@ -18,7 +18,7 @@ from raytwin.acquisition import Setting, open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.cli import main
 from raytwin.errors import InputError
-from raytwin.generator.twins.twin_io import write_twin
+from raytwin.generator.twins.twin_io import read_twin, write_twin
 
 SHAPE = (24, 28)
 EXPOSURE_MS = 20.0
@@ -117,6 +117,7 @@ def test_a_truncated_twin(files, tmp_path, capsys, keep):
     broken = damaged(files["twin"], tmp_path, keep)
     refused(capsys, tmp_path, ["predict", broken, "--kv", 60, *PREDICT, "--json"], mentions="damaged.h5")
     refused(capsys, tmp_path, ["validate", broken, files["session"], "--json"], mentions="damaged.h5")
+    refused(capsys, tmp_path, ["report", broken, "-o", tmp_path / "a.html"], mentions="the file of a twin, a dataset")
 
 
 def test_a_file_that_is_not_there(files, tmp_path, capsys):
@@ -128,8 +129,16 @@ def test_a_file_that_is_not_there(files, tmp_path, capsys):
 def test_the_wrong_kind_of_file(files, tmp_path, capsys):
     out = tmp_path / "out.h5"
     refused(capsys, tmp_path, ["calibrate", files["twin"], "-o", out], mentions="raytwin-acquisition")
-    refused(capsys, tmp_path, ["predict", files["session"], "--kv", 60, *PREDICT], mentions="raytwin-twin")
-    refused(capsys, tmp_path, ["validate", files["session"], files["twin"]], mentions="raytwin-twin")
+    swapped = "got an acquisition, frames of a session (format 'raytwin-acquisition'); expected a twin (format 'raytwin-twin')"
+    refused(capsys, tmp_path, ["predict", files["session"], "--kv", 60, *PREDICT], mentions=swapped)
+    refused(capsys, tmp_path, ["validate", files["session"], files["twin"]], mentions=swapped)
+    refused(
+        capsys,
+        tmp_path,
+        ["report", files["session"], "-o", tmp_path / "a.html"],
+        mentions="the file of a twin, a dataset",
+    )
+    refused(capsys, tmp_path, ["train", files["twin"], "-o", tmp_path / "runs"], mentions="got a twin (format")
     refused(
         capsys,
         tmp_path,
@@ -205,6 +214,12 @@ PREDICTIONS = {
     "a filter that stops everything": (["--kv", "60", "--filter", "W:100", *PREDICT], "filter"),
     "no frame": (["--kv", "60", "--averaged", "0", *PREDICT], "averaged"),
 }
+
+
+def test_a_detector_nearer_than_the_object_is_told(files):
+    words = {"kV": 60.0, "power_W": 40.0, "exposure_ms": 20.0}
+    said = [read_twin(files["twin"]).predict(**words, source_detector_mm=mm).warnings for mm in (100.0, 2970.0)]
+    assert [any("nearer to the source than the object" in line for line in lines) for lines in said] == [True, False]
 
 
 @pytest.mark.parametrize("case", PREDICTIONS)

@@ -76,6 +76,22 @@ def test_two_currents_tell_how_the_response_bends(make_model_twin):
     assert of_level == pytest.approx(math.hypot(found["value"], found["sd"]) * (2.0 - np.mean([1.0, 0.208])))
 
 
+@pytest.mark.parametrize("far_off", [{"source_detector_mm": 1.059}, {"exposure_ms": 1e-6}, {"exposure_ms": 1e12}])
+def test_a_setting_of_which_nothing_is_known_is_refused(make_model_twin, far_off):
+    points = [flat(0), flat(1, kV=40.0)]
+    evidence = {
+        "photon_transfer": [point.as_dict() for point in points],
+        "setting_errors": setting_errors(points, source_detector_mm=MM),
+    }
+    twin = dataclasses.replace(make_model_twin((8, 8)), evidence=evidence)
+    words = {"kV": 60.0, "current_mA": 1.0, "exposure_ms": 100.0}
+    assert twin.predict(**words).mean_DN.value > 0
+    with pytest.raises(
+        InputError, match=r"setting: got .* mm from the source, .*nearer to those of the calibrating flats"
+    ):
+        twin.predict(**{**words, **far_off})
+
+
 def test_two_distances_tell_where_the_focal_spot_is():
     points = [flat(0, near_mm=4.0), flat(1, mm=530.0, near_mm=4.0)]
     found = setting_errors(points, source_detector_mm=MM)["distance_mm"]

@@ -273,3 +273,10 @@ def test_plan_answers_with_images_sizes_and_limits(capsys, tmp_path):
     assert main(["plan", "--a50", "1"]) == 2
     assert main([*words, "--wanted", "1.15"]) == 0
     assert "expected a90/95" in capsys.readouterr().out
+
+
+def test_a_pilot_whose_pod_does_not_rise_says_so(refused_line, tmp_path):
+    lines = ["size,hit", *(f"{size},{int(size < 4)}" for size in (1, 2, 3, 4, 5, 6)), "5,1", "2,0"]
+    (tmp_path / "pilot.csv").write_text("\n".join(lines) + "\n")
+    line = refused_line("plan", "--pilot", tmp_path / "pilot.csv")
+    assert "a table of 8 trials in which POD does not rise with size; expected a pilot with" in line

@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
+import raytwin as rt
 from raytwin.cli import main
+from raytwin.errors import InputError
 
 PAIR = ["--low", "kv=40,power_w=40,exposure_ms=20", "--high", "kv=90,power_w=45,exposure_ms=20"]
 
@@ -90,7 +92,9 @@ def test_own_materials_and_a_measured_spectrum_take_part(json_of, tmp_path: Path
         (["spectrum", "--kv", "60", "--filter", "Cu"], "filter: got 'Cu'; expected MATERIAL:mm"),
         (["spectrum", "--kv", "60", "--filter", "Cu:-1"], "thickness of filter Cu: got -1.0 mm"),
         (["spectrum", "--kv", "60", "--model", "default"], "model: got 'default'"),
-        (["spectrum", "--kv", "sixty"], "argument --kv: invalid float value: 'sixty'"),
+        (["spectrum", "--kv", "sixty"], "argument --kv: got 'sixty'; expected a number"),
+        (["spectrum", "--kv", "60kV"], "argument --kv: got '60kV'; expected a number, without its unit"),
+        (["lab", "-o", "x.h5", "--protocol", "full", "--seed", "one"], "--seed: got 'one'; expected a whole number"),
         (["spectrum", "--spectrum-file", "missing.txt"], "spectrum file: got missing.txt; expected a readable file"),
         (["contrast", "--product", "water:9", "--object", "Al", *PAIR], "--object: got 'Al'; expected MATERIAL:mm"),
         (["contrast", "--product", "musle:9", "--object", "Al:1", *PAIR], "--product: got 'musle'"),
@@ -123,3 +127,15 @@ def test_help_holds_an_example(capsys: pytest.CaptureFixture[str], command: str)
     with pytest.raises(SystemExit, match="0"):
         main([command, "--help"])
     assert f"example:\n  raytwin {command}" in capsys.readouterr().out
+
+
+def test_attenuation_through_a_twin_in_memory_says_of_what() -> None:
+    assert rt.mu("water", kV=60, twin=rt.read_twin("virtual_lab")).where == "60 kV of a twin in memory"
+
+
+@pytest.mark.parametrize("given", [5, ["Al:1", 5], None, {"Al": 1.0}.values()])
+def test_layers_that_are_neither_texts_nor_filters_are_one_line(given) -> None:
+    with pytest.raises(InputError, match=r'filter: got .*; expected a text such as "Cu:0.1'):
+        rt.spectrum(kV=60, filter=given)
+    with pytest.raises(InputError, match=r'filter: got .*; expected a text such as "Cu:0.1'):
+        rt.mu("water", kV=60, cover=given)

@@ -16,7 +16,7 @@ from raytwin.campaign.sweep_add import add_setting
 from raytwin.campaign.sweep_file import read_campaign
 from raytwin.errors import FileFormatError, InputError
 from raytwin.explore.known_pod import read_known_pod
-from raytwin.explore.page import numbers_text, object_diameter_mm
+from raytwin.explore.page import added_text, numbers_text, object_diameter_mm
 from raytwin.explore.picture import draw_pair
 from raytwin.explore.server import tunnel_command
 from raytwin.explore.state import ExplorerState, first_state, ranges_of
@@ -324,6 +324,35 @@ def test_a_campaign_grows_by_the_pairs_that_are_added_and_keeps_its_text(tmp_pat
     assert [str(low) for low, _ in campaign.settings] == [LOW, LOW.replace("kv=40", "kv=50")]
     assert path.read_text().startswith("# mine\n")
     assert sorted(one.name for one in tmp_path.iterdir()) == ["campaign.toml", "campaign_scene.toml"]
+
+
+def test_a_campaign_of_other_materials_says_so_and_its_command_can_be_copied(tmp_path: Path) -> None:
+    path = tmp_path / "my campaign.toml"
+    seen = ("Al", "air")
+    other = {
+        name: Filter(material=one, thickness_mm=2.0)
+        for name, one in zip(("product", "foreign_object"), seen, strict=True)
+    }
+    assert "stays so" not in added_text(_added(path), seen=seen)  # type: ignore[arg-type]
+    for low in (LOW, LOW.replace("kv=40", "kv=50")):
+        text = added_text(_added(path, low=low, **other), seen=seen)  # type: ignore[arg-type]
+        assert (
+            "This campaign is of chicken_breast with rib_bone, and stays so; for Al with air start with another file"
+            in text
+        )
+    assert text.endswith(f"Next: raytwin sweep '{path}' --plan")
+
+
+@pytest.mark.parametrize("name", ["twin.h5", "none.h5", "none.toml"])
+def test_references_that_no_campaign_can_take_are_refused_at_the_start(
+    tmp_path: Path,
+    make_model_twin,  # type: ignore[no-untyped-def]
+    refused_line,  # type: ignore[no-untyped-def]
+    name: str,
+) -> None:
+    make_model_twin((16, 16)).save(tmp_path / "twin.h5")
+    words = ("explore", "virtual_lab", "--no-browser", "--references", tmp_path / name)
+    assert name in refused_line(*words)
 
 
 def test_a_campaign_that_would_be_none_is_not_written(tmp_path: Path) -> None:

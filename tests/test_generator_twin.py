@@ -181,9 +181,10 @@ def replaced(file, name, values):
 
 
 DAMAGES = {
-    "another format": (lambda file: file.attrs.modify("format", "other"), "other version 1"),
-    "another version": (lambda file: file.attrs.modify("version", 2), "raytwin-twin version 2"),
-    "no format": (lambda file: file.attrs.pop("format"), "no format"),
+    "another format": (lambda file: file.attrs.modify("format", "other"), "got format 'other'; expected a twin"),
+    "another version": (lambda file: file.attrs.modify("version", 2), "raytwin-twin version 2.*calibrate again"),
+    "another kind": (lambda file: file.attrs.modify("format", "raytwin-dataset"), "got a dataset.*`raytwin calibrate`"),
+    "no format": (lambda file: file.attrs.pop("format"), "without a `format`"),
     "a missing map": (lambda file: file["maps"].pop("dark_DN"), "damaged file"),
     "no levels": (lambda file: file.pop("levels"), "damaged file"),
     "a list for names": (lambda file: file.attrs.modify("provenance", "[]"), "damaged file"),

@@ -215,7 +215,23 @@ def test_eight_bit_grey_and_grey_stored_as_colour_are_grey(tmp_path):
         ),
         (
             lambda root: (root / "raytwin.toml").write_text("[[series]]\nkind='flat'\nfiles='dark/*.tif'\nkV=-40\n"),
-            "attribute kV: got -40 kV; expected a finite number above 0 kV",
+            "import: error: raytwin.toml, series 1, kV: got -40 kV; expected a finite number above 0 kV",
+        ),
+        (
+            lambda root: (root / "raytwin.toml").write_text(
+                "[[series]]\nkind='dark'\nfiles='dark/*.tif'\nexposure_ms=-20\n"
+            ),
+            "import: error: raytwin.toml, series 1, exposure_ms: got -20 ms; expected a finite number of 0 or more ms",
+        ),
+        (
+            lambda root: (root / "raytwin.toml").write_text(SIDECAR.replace("size_mm = 3.5", "size_mm = -3.5")),
+            "import: error: raytwin.toml, scene 1, size_mm: got -3.5 mm",
+        ),
+        (
+            lambda root: (root / "raytwin.toml").write_text(
+                "[instrument]\npixel_mm = -1\n" + SIDECAR[SIDECAR.index("[[") :]
+            ),
+            "import: error: raytwin.toml, [instrument], instrument pixel_mm: got -1",
         ),
         (
             lambda root: (root / "raytwin.toml").write_text("[[series]]\nkind='flat'\nfor_each='no*'\nfiles='*'\n"),
@@ -826,7 +842,10 @@ def test_bad_pixels_of_a_twin_are_replaced_in_every_image(pairs, tmp_path):
 
 def test_the_name_of_a_shipped_twin_gives_its_bad_pixels(pairs, tmp_path, refused_line):
     words = ["import", "reference", str(pairs), "-o", str(tmp_path / "d.h5"), "--twin", "virtual_lab"]
-    assert "bad-pixel mask: got shape (64, 64); expected shape (12, 17)" in refused_line(*words)
+    assert (
+        "map of bad pixels: got 64 x 64 pixels; expected 12 x 17 pixels as in the images; give the map, or the twin"
+        in refused_line(*words)
+    )
 
 
 def test_the_sidecars_of_the_manual_are_read(folder, pairs, tmp_path):

@@ -155,7 +155,10 @@ def test_the_command_plants_effects_and_names_them_in_the_truth(tmp_path, capsys
         (["--protocol", "calibration", "--frames", "1"], "frames: got 1; expected 2 or more"),
         (["--protocol", "set1", "--pixel-mm", "nan"], "--pixel-mm: got nan mm"),
         (["--protocol", "set1", "--seed", "-1"], "--seed: got -1"),
-        (["--protocol", "set1", "--effect", "image_lag=2"], "it belongs to a long session (full, short or products)"),
+        (
+            ["--protocol", "set1", "--effect", "image_lag=2@always", "--effect", "row_noise=1"],
+            "got image_lag=2@always, row_noise=1; expected nothing: it belongs to a long session (full, short or products)",
+        ),
         (["--protocol", "full", "--effect", "lag=2"], "effect: got 'lag'; expected an effect's id, such as image_lag"),
         (["--protocol", "full", "--effect", "image_lag"], "--effect: got 'image_lag'; expected ID=STRENGTH; write ID="),
         (["--protocol", "full", "--effect", "image_lag=x"], "--effect: got 'image_lag=x'; expected ID=STRENGTH"),

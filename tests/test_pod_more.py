@@ -501,8 +501,9 @@ def test_recommended_sizes_beat_sizes_made_at_random():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: AssumedCurve(a50=2, a90=1), "an a90 above the a50"),
-        (lambda: AssumedCurve(a50=-1, a90=1, log_size=True), "a size above 0 on log size"),
+        (lambda: AssumedCurve(a50=2, a90=1), "the a90 above the a50"),
+        (lambda: AssumedCurve(a50=-1, a90=1), "sizes above 0"),
+        (lambda: AssumedCurve(a50=0, a90=1, log_size=True), "sizes above 0"),
         (lambda: AssumedCurve(a50=1, a90=2, sd_image=-1), "a finite spread of 0 or more"),
         (lambda: AssumedCurve(a50=1, a90=2, link="log"), "link"),
         (lambda: plan_pod(AssumedCurve(a50=1, a90=2), wanted_over_a90=0.9), "a ratio above 1"),

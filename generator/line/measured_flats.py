@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...acquisition.setting import Setting
-from ...errors import InputError
-from .twin import Level, Twin
+from ...errors import LARGEST, InputError
+from .twin import Z95, Level, Twin
 
 USUAL_STRAY = 0.002  # relative, of a flat that is repeated
 
@@ -93,7 +93,7 @@ def stray_of_setting(
         signal_DN: the level itself.
 
     Raises:
-        InputError: evidence that cannot be read.
+        InputError: evidence that cannot be read, or a setting so far off that a 95 % interval spans all numbers there are.
     """
     errors = twin.evidence.get("setting_errors")
     if errors is None:
@@ -116,9 +116,17 @@ def stray_of_setting(
             exposure_ms=setting.exposure_ms, source_detector_mm=distance_mm, share=signal_DN / largest_DN
         )
         change = there - np.mean(known, axis=0)
-        return stray_of_rates(errors, change), stray_of_rates(errors, change * (1.0, 1.0, 4.0))
+        of_level, of_noise = (stray_of_rates(errors, change * (1.0, 1.0, bend)) for bend in (1.0, 4.0))
     except (TypeError, KeyError, ValueError, ZeroDivisionError):
         raise _unreadable("setting_errors", "`second_moments` of 3 x 3 numbers and `largest_DN`") from None
+    if not Z95 * max(of_level, of_noise) < math.log(LARGEST):
+        raise InputError(
+            "setting",
+            received=f"{setting.exposure_ms:g} ms at {distance_mm:g} mm from the source, {signal_DN:.3g} DN",
+            expected="exposure, distance and level nearer to those of the calibrating flats, from which they can be told",
+            remedy="lengths are in mm and times in ms; or calibrate with flats nearer to this setting",
+        )
+    return of_level, of_noise
 
 
 def _unreadable(name: str, expected: str) -> InputError:

@@ -367,6 +367,11 @@ def _without_effects(twin: Twin, setting: Setting) -> Prediction:
 def _distance_mm(twin: Twin, setting: Setting, level: Level | None, warnings: list[str]) -> float:
     """From the source to the detector; what is not known of it, or of the pixels, goes to the warnings."""
     distance_mm = setting.source_detector_mm or twin.instrument.source_detector_mm
+    at_object_mm = twin.instrument.source_object_mm
+    if distance_mm is not None and at_object_mm is not None and distance_mm < at_object_mm:
+        warnings.append(
+            f"the detector at {distance_mm:g} mm stands nearer to the source than the object at {at_object_mm:g} mm"
+        )
     if distance_mm is None:
         distance_mm = level.source_detector_mm if level is not None and level.source_detector_mm else 1000.0
         if twin.spectral is not None:

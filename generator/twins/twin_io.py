@@ -226,7 +226,7 @@ def read_any_twin(path: str | os.PathLike[str]) -> Twin | TubeTwin:
     Raises:
         FileFormatError: no such file, not HDF5, truncated, another format or version, or parts missing.
     """
-    from ...acquisition._hdf5 import HDF5_ERRORS, open_hdf5
+    from ...acquisition._hdf5 import HDF5_ERRORS, check_format, open_hdf5
 
     if not os.path.isfile(path):
         raise FileFormatError(
@@ -234,14 +234,13 @@ def read_any_twin(path: str | os.PathLike[str]) -> Twin | TubeTwin:
         )
     with open_hdf5(path, what="a twin file that `raytwin calibrate` wrote") as file, bounded(_READING_S):
         try:
-            found = (_text(file.attrs.get("format", "no format")), int(file.attrs.get("version", 0)))
-            if found != (FORMAT, VERSION):
-                raise FileFormatError(
-                    f"twin {path}",
-                    received=f"{found[0]} version {found[1]}",
-                    expected=f"{FORMAT} version {VERSION}",
-                    remedy="calibrate again with this raytwin",
-                )
+            check_format(
+                file,
+                path=f"twin {path}",
+                format_name=FORMAT,
+                version=VERSION,
+                remedy="calibrate again with this raytwin",
+            )
             if _text(file.attrs.get("part", "")) == TUBE:
                 return _tube_from_file(file, path)
             return _twin_from_file(file, path)

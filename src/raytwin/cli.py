@@ -8,6 +8,7 @@ import sys
 import traceback
 from collections.abc import Collection, Mapping, Sequence
 from difflib import get_close_matches
+from typing import Any
 
 from . import __version__
 from ._log import kept_in, taken_out
@@ -100,8 +101,27 @@ _REMEDY_OF_SYSTEM = {
 }
 
 
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"got {text!r}; expected a number, without its unit") from None
+
+
+def _whole_number(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"got {text!r}; expected a whole number") from None
+
+
 class _Parser(argparse.ArgumentParser):
     """Bad usage is one clear line and exit code 2."""
+
+    def __init__(self, *arguments: Any, **words: Any) -> None:
+        super().__init__(*arguments, **words)
+        self.register("type", float, _number)
+        self.register("type", int, _whole_number)
 
     def error(self, message: str) -> None:  # type: ignore[override]
         self.exit(2, f"{self.prog}: error: {message} (see `{self.prog} --help`)\n")

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -349,10 +349,15 @@ def as_layers(value: Layers, library: Library) -> tuple[Filter, ...]:
     """Layers from texts or filters; each name is looked up, a NIST name with commas by its plain spelling.
 
     Raises:
-        InputError: a text that is no layer, or a material that nobody knows.
+        InputError: neither texts nor filters, a text that is no layer, or a material that nobody knows.
     """
     layers = []
-    for item in (value,) if isinstance(value, str | Filter) else value:
+    given = tuple(value) if isinstance(value, Iterable) and not isinstance(value, str) else (value,)
+    for item in given:
+        if not isinstance(item, str | Filter):
+            raise InputError(
+                "filter", received=repr(value), expected='a text such as "Cu:0.1+Al:1", a Filter, or a list of these'
+            )
         parts = (
             [item] if isinstance(item, Filter) else [part for part in item.split("+") if part.strip() or item.strip()]
         )
@@ -593,7 +598,7 @@ def _mu_of_twin(
 
 
 def _name_of(twin: Any) -> str:
-    return str(twin) if isinstance(twin, str | os.PathLike) else "in memory"
+    return str(twin) if isinstance(twin, str | os.PathLike) else "a twin in memory"
 
 
 def mu(
@@ -783,7 +788,7 @@ def contrast(
         if not 1 <= len(values) <= MOST_VALUES:
             raise InputError(f"map, {name}", received=f"{len(values)} values", expected=f"1 to {MOST_VALUES}")
     source = _line_of(twin, line)
-    told = str(twin) if isinstance(twin, str | os.PathLike) else None if twin is None else "in memory"
+    told = None if twin is None else _name_of(twin)
     words: dict[str, Any] = {"product": slabs[0], "foreign_object": slabs[1], "displaces": displaces}
     if not axes:
         found = predict_contrast(source, low=pair[0], high=pair[1], object_pixels=object_pixels, **words)

@@ -81,6 +81,7 @@ def _page_of(result: Any) -> Any:
     from ..calibration.validate import Validation
     from ..generator.line.twin import Twin
     from ..generator.predictions.tube_twin import TubeTwin
+    from ..generator.twins.twin_io import FORMAT as TWIN_FORMAT
 
     if isinstance(result, PodCurve):
         return _pod_page(result)
@@ -95,7 +96,15 @@ def _page_of(result: Any) -> Any:
         _refuse_diagnosis(Path(result))
     if is_file and Path(result).suffix.lower() == ".csv":
         return _pod_page(_curve_of_hits(result))
-    if isinstance(result, dataset_io.Dataset) or (is_file and format_of_file(result) == dataset_io.FORMAT):
+    kind = format_of_file(result) if is_file else None
+    if is_file and kind not in (TWIN_FORMAT, dataset_io.FORMAT) and Path(result).is_file():
+        raise FileFormatError(
+            str(result),
+            received="a file that cannot be read as HDF5, or without a format" if kind is None else f"format {kind!r}",
+            expected=_EXPECTED,
+            remedy="a damaged file has to be copied or made again" if kind is None else "",
+        )
+    if isinstance(result, dataset_io.Dataset) or kind == dataset_io.FORMAT:
         from ..campaign.dataset_page import dataset_page
 
         with dataset_of(result) as dataset:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import numpy as np
     import pandas
 
-    from ..pod import Plan, Precision
+    from ..pod import Plan, PodFit, Precision
     from ..pod.planning import AssumedCurve
     from .curves import TableLike
 
@@ -110,7 +110,7 @@ def plan(
     """How many images and networks a POD study needs, and which sizes to make.
 
     Args:
-        a50, a90: the curve that is expected, in any unit.
+        a50, a90: the curve that is expected, in any unit, above 0.
         pilot: in their place a curve of `fit_pod` or a table, whose curve and spreads are taken.
         size, link, log_size: of the pilot's table, or of the assumed curve.
         sd_network, sd_image: spread between networks and images on the link's scale.
@@ -173,6 +173,17 @@ def plan(
     )
 
 
+def _what_is_missing(fit: "PodFit") -> str:
+    """Why a curve has no a50 or no a90."""
+    if fit.c1 is None:
+        return "; ".join(("no curve", *fit.warnings))
+    if not fit.c1 > 0.0:
+        return f"a table of {fit.n} trials in which POD does not rise with size"
+    percent = 50 if fit.a50 is None else 90
+    tested = f"{fit.smallest_size:.4g} to {fit.largest_size:.4g}"
+    return f"a curve that does not cross POD {percent} % within the tested sizes, {tested}"
+
+
 def _warnings_of_few(images: int | None) -> tuple[str, ...]:
     from ..pod.planning import FEW_TRIALS
 
@@ -208,9 +219,9 @@ def _assumed(
     if fit.a50 is None or fit.a90 is None:
         raise InputError(
             "pilot",
-            received="; ".join(fit.warnings) or "no curve",
+            received=_what_is_missing(fit),
             expected="a pilot with an a50 and an a90",
-            remedy="give a50 and a90",
+            remedy="give another table or size column, or a50 and a90",
         )
     if fit.repeats == "cluster" and networks > 1:
         raise InputError(

@@ -67,6 +67,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(
             "--observer", received="no --references", expected="the dataset whose objects the networks look for"
         )
+    if arguments.references is not None:
+        _check_references(arguments.references)
     listening = listen(arguments.port)
     import numba
 
@@ -114,3 +116,18 @@ def run(arguments: argparse.Namespace) -> int:
         told=told,
     )
     return 0
+
+
+def _check_references(path: Path) -> None:
+    """Refuse what no campaign can take as references.
+
+    Raises:
+        InputError, FileFormatError: neither a dataset nor a description.
+    """
+    from ..acquisition import read_dataset
+    from ..generator.scenes.describe import read_description
+
+    if path.suffix.lower() == ".toml":
+        read_description(path)
+    else:
+        read_dataset(path).close()

@@ -2,11 +2,12 @@
 
 import html
 import itertools
+import shlex
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from ..results import between_text, same_value
 from .seen_size import SeenSize
 from .state import ExplorerState, first_state
 from .view import BeamView, Explorer, ExplorerView, MapView
+
+if TYPE_CHECKING:
+    from ..campaign.sweep_add import AddedSetting
 
 LOW_COLOUR, HIGH_COLOUR = "#0072B2", "#D55E00"  # apart for every kind of colour vision (Okabe and Ito)
 Changes = dict[str, dict[str, Any]]  # model by name -> property -> value
@@ -391,11 +395,20 @@ class _Page:
         except (RaytwinError, OSError) as error:
             self._send({"added": {"text": _problem_text(str(error)), "visible": True}})
             return
-        what = "The pair was added" if done.new else "The pair is in it already"
-        more = f" Products and objects are described in {done.description}." if done.description else ""
-        count = _counted(done.settings, "setting")
-        text = _note(f"{what}: {done.path}, {count}.{more} Next: raytwin sweep {done.path} --plan")
-        self._send({"added": {"text": text, "visible": True}})
+        seen = (state.product.material, state.foreign_object.material)
+        self._send({"added": {"text": _note(added_text(done, seen=seen)), "visible": True}})
+
+
+def added_text(done: "AddedSetting", *, seen: tuple[str, str]) -> str:
+    """What was done to the campaign, and the command that runs it; seen: materials of product and foreign object on the page."""
+    text = f"{'The pair was added' if done.new else 'The pair is in it already'}: {done.path}, "
+    text += f"{_counted(done.settings, 'setting')}."
+    if done.description is not None:
+        text += f" Products and objects are described in {done.description}."
+    if done.other_materials is not None:
+        theirs, these = (f"{product} with {found}" for product, found in (done.other_materials, seen))
+        text += f" This campaign is of {theirs}, and stays so; for {these} start with another file: --campaign FILE."
+    return f"{text} Next: {shlex.join(['raytwin', 'sweep', str(done.path), '--plan'])}"
 
 
 def object_diameter_mm(state: ExplorerState, pixel_mm: float) -> float:

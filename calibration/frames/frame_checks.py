@@ -337,7 +337,9 @@ def _change(
         # what noise alone gives to the coefficients, so that only more than that is a change
         spread = robust_sd(left.reshape(-1)[alive], about=0.0) * noise_growth / math.sqrt(left.size)
         by_noise = spread**2 * float(chdtri(len(design), FALSE_ALARM))
-        shape = math.sqrt(max(float(np.var(smooth - level * middle)) - by_noise, 0.0)) / signal
+        # of another level are a factor and an offset: beside a dark whose pattern is deeper than the signal it is no factor
+        unlike = min(float(np.var(smooth - level * middle)), float(np.var(smooth)))
+        shape = math.sqrt(max(unlike - by_noise, 0.0)) / signal
         level = math.copysign(max(abs(level) - _two_sided_limit(FALSE_ALARM) * spread / signal, 0.0), level)
     lines = max(float(np.max(np.abs(np.median(left, axis=axis)))) for axis in (0, 1))
     return _Change(level=level, shape=shape, lines_DN=lines, left=left)

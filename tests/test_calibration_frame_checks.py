@@ -138,8 +138,8 @@ def test_dim_frames_whose_structure_is_noise_alone_are_one_scene(signal):
 def test_a_dim_flat_over_a_dark_whose_pattern_is_deeper_than_its_signal_is_one_scene():
     """A common factor of the frames would multiply the pattern of the dark as well."""
     rng = np.random.default_rng(3)
-    across = 200.0 * np.sin(np.linspace(0.0, 9.0, 128))
-    frames = DARK_DN + across + 5.0 + 10.0 * rng.standard_normal((20, 96, 128))
+    across = 200.0 * np.sin(np.linspace(0.0, 4.0 * np.pi, 128))
+    frames = DARK_DN + across + 8.0 + 10.0 * rng.standard_normal((20, 96, 128))
     assert same_scene([np.rint(frames).astype(np.uint16)], offset_DN=DARK_DN).same is True
 
 

@@ -372,15 +372,24 @@ def _version_of(anode: str, anode_angle_deg: float, model: str) -> str:
     return packaged or spekpy_version()
 
 
+def checked_anode(anode: str) -> str:
+    """The anode's element, if spectra are known of it.
+
+    Raises:
+        InputError: another one.
+    """
+    if anode not in MAXIMUM_KV_OF_ANODE:
+        raise InputError("anode", received=repr(anode), expected=f"one of {', '.join(MAXIMUM_KV_OF_ANODE)}")
+    return anode
+
+
 def checked_kV(kV: float, *, anode: str) -> float:
     """The tube voltage, kV, if the spectra of an anode are known there.
 
     Raises:
         InputError: an unknown anode, or a voltage outside its range.
     """
-    if anode not in MAXIMUM_KV_OF_ANODE:
-        raise InputError("anode", received=repr(anode), expected=f"one of {', '.join(MAXIMUM_KV_OF_ANODE)}")
-    highest = MAXIMUM_KV_OF_ANODE[anode]
+    highest = MAXIMUM_KV_OF_ANODE[checked_anode(anode)]
     check_number("kV", kV, unit="kV")
     if not MINIMUM_KV <= kV <= highest:
         raise InputError(

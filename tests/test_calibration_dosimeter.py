@@ -121,6 +121,12 @@ def test_half_value_layers_tell_the_filtration_and_no_output():
     assert output.high - output.low > 0.9  # the prior's width
 
 
+def test_an_anode_without_spectra_is_named_before_anything_is_computed():
+    ratio = KermaRatio(kV=60.0, filters=(), layers=(), value=0.5, relative_sd=0.01)
+    with pytest.raises(InputError, match=r"^anode: got 'Q'; expected one of W, Mo"):
+        fit_spectrum([], Instrument(anode="Q"), rng=np.random.default_rng(2), ratios=[ratio])
+
+
 def _half_value(kV):
     low, high = 0.0, 20.0
     for _ in range(50):

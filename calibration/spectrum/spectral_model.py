@@ -20,7 +20,7 @@ from ...generator.line.spectral_signal import (
     SpectrumCorrection,
 )
 from ...generator.line.twin import Level
-from ...spectra import BIN_WIDTH_KEV, Spectrum
+from ...spectra import BIN_WIDTH_KEV, Spectrum, checked_anode
 from .dose_data import DOSE_PRIORS, FREE_KERMA_OUTPUT
 from .priors import (
     ATTENUATION_SCALE,
@@ -62,7 +62,7 @@ def model_for(
     """
     undeclared = instrument.scintillator is None and not instrument.counting
     result = SpectralModel(
-        anode=instrument.anode or "W",
+        anode=checked_anode(instrument.anode or "W"),
         anode_angle_deg=instrument.anode_angle_deg or 12.0,
         model=model_name,
         inherent=instrument.inherent_filtration or (),

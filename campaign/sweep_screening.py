@@ -270,7 +270,7 @@ class Screen:
     """
 
     def __init__(self, campaign: Campaign, tests: Path, outlooks: Sequence[Outlook]) -> None:
-        from ..observers import LineImages, Observer, materials_seen, read_efficiency, sight_of_references
+        from ..observers import LineImages, Observer, check_materials, read_efficiency, sight_of_references
 
         screening = campaign.screening or Screening()
         self.campaign, self._screening = campaign, screening
@@ -285,7 +285,11 @@ class Screen:
                     received=f"an observer calibrated for {self.efficiency.size_name}",
                     expected=f"one for {campaign.curve.size}, the size of this campaign",
                 )
-            materials_seen(self.efficiency, campaign.product_material, campaign.foreign_material)
+            check_materials(
+                self.efficiency,
+                product_material=campaign.product_material,
+                foreign_material=campaign.foreign_material,
+            )
         calibrated = None if self.efficiency is None else self.efficiency.observer
         detector = screening.detector if calibrated is None else calibrated.detector
         self.line: LineImages = LineImages(read_twin(campaign.twin))

@@ -20,8 +20,8 @@ _POINTS: dict[str, tuple[str, Shape]] = {
     "recommended": (BEFORE, "square"),
     "on the front": (BEFORE, "circle"),
     "on the front, expected": (BEFORE, "diamond"),
-    "beaten in all three": (AFTER, "circle"),
-    "beaten in all three, expected": (QUIET, "diamond"),
+    "not on the front": (AFTER, "circle"),
+    "not on the front, expected": (QUIET, "diamond"),
 }
 
 
@@ -211,7 +211,7 @@ def expected_charts(answer: Mapping[str, Any]) -> dict[str, Chart]:
             at = row[name]["value"] if isinstance(row[name], Mapping) else row[name]
             if a90 is None or at is None or not row["feasible"]:
                 continue
-            best = "on the front" if row["setting"] in front else "beaten in all three"
+            best = "on the front" if row["setting"] in front else "not on the front"
             kind = "recommended" if row["recommended"] else best if row["a90"] is not None else f"{best}, expected"
             groups[kind].append((factor * at, a90, str(row["label"])))
         marks: list[Any] = [Rule(at=required["size"], colour="#111111", label="asked for")]

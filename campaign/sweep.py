@@ -22,7 +22,7 @@ from ..generator.twins.twin_io import read_twin
 from ..observers import write_efficiency
 from ._plain import digest, plain, read_object
 from .decision import NO_LOOKS, Change, Looks, Verdict, decide, judge_row
-from .sweep_choice import choose, indistinct, pareto_front, sentence, takes_part
+from .sweep_choice import a90_for_front, choose, indistinct, pareto_front, sentence, takes_part
 from .sweep_file import Campaign, CurveOptions, Pair
 from .sweep_runners import Runner
 from .sweep_settings import Outlook, Scout, keep_best, labels_of
@@ -445,7 +445,7 @@ def _answer(
             )
             row["verdict"] = verdicts[-1].verdict
     choice = choose(rows, goal=goal, most_false_alarms=most)
-    front = set(pareto_front([row if takes_part(row, most) else {**row, "a90": None} for row in rows]))
+    front = set(pareto_front([{**row, "a90": a90_for_front(row, most)} for row in rows]))
     for number, row in enumerate(rows):
         ratio, alike = None, False
         if choice.best is not None and number != choice.best and row["a90"] is not None:

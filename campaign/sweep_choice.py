@@ -30,6 +30,17 @@ def paces(rows: Sequence[Row]) -> list[float]:
     return [float(row.get(name) or 0.0) for row in rows]
 
 
+def a90_for_front(row: Row, most_false_alarms: float | None) -> float | None:
+    """a90 with which a row stands for the front: of its networks, else what an observer expects of them.
+
+    None: not known, a setting that cannot be, or networks with more false alarms than allowed.
+    """
+    if not row["feasible"] or (row["trained"] and not _alarms_allowed(row, most_false_alarms)):
+        return None
+    value = row["a90"] if row["a90"] is not None else (row["predicted"] or {}).get("value")
+    return None if value is None else float(value)
+
+
 def pareto_front(rows: Sequence[Row]) -> list[int]:
     """Numbers of the rows that no other beats: none has as small an a90, as low a dose and as high a pace, and one of them better.
 
@@ -80,8 +91,10 @@ def choose(rows: Sequence[Row], *, goal: float | None, most_false_alarms: float 
 
 def takes_part(row: Row, most_false_alarms: float | None) -> bool:
     """Whether a row may be recommended: it has an a90, and no more false alarms than allowed."""
-    if row.get("a90") is None:
-        return False
+    return row.get("a90") is not None and _alarms_allowed(row, most_false_alarms)
+
+
+def _alarms_allowed(row: Row, most_false_alarms: float | None) -> bool:
     rate = row.get("false_alarm_rate")
     return most_false_alarms is None or (rate is not None and float(rate["value"]) <= most_false_alarms)
 

@@ -192,6 +192,7 @@ def test_the_observer_of_a_sweep_is_kept_and_says_the_same_elsewhere(line, ahead
     # and a sweep with it calibrates on no setting
     again, networks = swept(line, ahead, tmp_path / "again", text=(line / "plan.toml").read_text())
     assert again["screening"]["calibrating"] == [] and again["recommended"] in networks.trained
+    assert {one["setting"] for one in again["decision"]["front"]} == set(again["pareto"])
 
 
 def test_bytes_depend_neither_on_the_order_nor_on_a_stop(line, ahead, tmp_path):

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import FitError, InputError, RaytwinError
-from ..files import only_one, whole_file, write_json
+from ..files import only_one, remove_parts, whole_file, write_json
 from ..generator.twins.twin_io import read_twin
 from ..observers import write_efficiency
 from ._plain import digest, plain, read_object
@@ -154,6 +154,7 @@ def run_sweep(
     progress = progress or Progress()
     _claim(directory)
     with only_one(directory, "a sweep"):
+        remove_parts(directory)
         found = tuple(outlooks) if outlooks is not None else look_ahead(campaign)
         basis = basis_of(campaign, version=version)
         if another := _answer_of_another(directory, campaign, basis):

@@ -142,7 +142,7 @@ def _screening_text(screening: Mapping[str, Any]) -> str:
         f" internal noise of {who['internal_noise']:.3g}; settings left out of its calibration are met to"
         f" {100 * screening['left_out_rms']:.0f} % (rms, the networks' own error included)."
     )
-    return text
+    return " ".join([text, *(f"Its {warning}." for warning in screening["warnings"])])
 
 
 def charts_of_both_sizes(row: Mapping[str, Any], answer: Mapping[str, Any]) -> list[Chart]:

@@ -223,7 +223,10 @@ def _screened(
             progress.tell(f"{len(chosen)} undecided settings are trained next; {left} others wait for the observer")
         work(chosen, before=len(asked))
         asked += chosen
-    return screened_rows(screen, rows, asked)
+    screened = screened_rows(screen, rows, asked)
+    for text in screened.answer["warnings"]:
+        progress.tell(f"warning: {text}")
+    return screened
 
 
 def seconds_of(directory: Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:

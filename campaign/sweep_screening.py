@@ -451,6 +451,18 @@ def outlooks_of_rows(rows: Sequence[Mapping[str, Any]]) -> list[Outlook]:
     ]
 
 
+def plan_warnings(campaign: Campaign, outlooks: Sequence[Outlook]) -> tuple[str, ...]:
+    """Why no observer can be calibrated, as far as it is known before training."""
+    from ..observers.efficiency import FEWEST_SETTINGS
+
+    kept = sum(one.kept for one in outlooks)
+    if campaign.screening is None or campaign.screening.observer is not None or kept >= FEWEST_SETTINGS:
+        return ()
+    return (
+        f"[screening]: {kept} settings can be trained, and an observer is calibrated on {FEWEST_SETTINGS} or more: none comes of it",
+    )
+
+
 def screened_rows(screen: Screen, rows: Mapping[str, dict[str, Any]], asked: Sequence[str]) -> Screened:
     """What the observer expects, written into the rows of all settings, and why those that were not trained were not."""
     from ..observers.efficiency_io import efficiency_to_mapping
@@ -484,6 +496,7 @@ def screened_rows(screen: Screen, rows: Mapping[str, dict[str, Any]], asked: Seq
             ),
             "left_out_rms": None if efficiency is None else efficiency.left_out_rms,
             "why_none": screen.why_none,
+            "warnings": [] if efficiency is None else list(efficiency.warnings),
         },
     )
 

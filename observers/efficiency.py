@@ -108,6 +108,18 @@ class Efficiency:
         return len(self.left_out) - 2
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to know before the numbers are used: an ideal observer that networks surpass."""
+        efficiency = self.observer.efficiency
+        if self.observer.detector != "ideal" or efficiency <= 1:
+            return ()
+        reach = math.exp(Z95 * math.sqrt(self.covariance[0][0]))
+        return (
+            f"efficiency {efficiency:.3g} (95 %: {efficiency / reach:.2g} to {efficiency * reach:.2g}) is above 1:"
+            " networks see more than the observer's image and noise hold",
+        )
+
+    @property
     def left_out_rms(self) -> float:
         """Root mean square of ln(measured / predicted) over settings that were left out."""
         return math.sqrt(float(np.mean([math.log(one.measured / one.predicted) ** 2 for one in self.left_out])))
@@ -261,7 +273,7 @@ def fit_efficiency(
             "measured a90",
             received=f"{len(known)} settings with an a90 and its interval",
             expected=f"{FEWEST_SETTINGS} or more",
-            remedy="train networks at more settings, at some with less noise",
+            remedy="train three networks or more, at more settings, at some with less noise",
         )
     pairs = [one.pair for one in known]
     prepared = PreparedSettings(line, pairs, objects, observer=observer, texture=texture)

@@ -399,3 +399,19 @@ def test_references_that_are_not_finite_are_refused(line, tmp_path):
         file["images"][1, 0, 30:34, 30:34] = np.nan
     with pytest.raises(FileFormatError, match="a value that is not finite"):
         rt.observe(read_twin(line / "twin.h5"), PAIR, references=path)
+
+
+def test_what_keeps_an_observer_from_being_calibrated_is_said_before_training(line):
+    fewer = CAMPAIGN.replace("[4, 6, 9, 14, 20, 30, 45, 70]", "[20]")
+    (line / "fewer.toml").write_text(fewer)
+    plan = rt.sweep(line / "fewer.toml", plan_only=True)
+    (told,) = plan.warnings
+    assert told.startswith("[screening]: 3 settings can be trained, and an observer is calibrated on 4 or more")
+    assert told in repr(plan) and plan.to_dict()["warnings"] == [told]
+    (line / "fewer.toml").write_text(fewer.replace("[screening]\nround = 3\n", ""))
+    assert rt.sweep(line / "fewer.toml", plan_only=True).warnings == ()
+    (line / "fewer.toml").write_text(CAMPAIGN.replace("test_share = 0.4", "test_share = 0.15"))
+    with pytest.raises(
+        InputError, match=r"foreign objects of known contrast above 0 to try networks on; expected 5 or"
+    ):
+        rt.sweep(line / "fewer.toml", plan_only=True)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from raytwin.acquisition.setting import Filter, setting_from_text
+from raytwin.api.observers import CalibratedObserver
 from raytwin.errors import FileFormatError, InputError
 from raytwin.generator.predictions.contrast import SlabContrasts
 from raytwin.generator.spread.psf import whole_spectrum
@@ -361,6 +362,20 @@ def test_a_calibrated_observer_is_read_back_as_written(line, tmp_path):
         read_efficiency(tmp_path / "cut.json")
     with pytest.raises(InputError, match="4 or more"):
         fit_efficiency(line, measured[:3], objects, observer=Observer())
+
+
+def test_an_ideal_observer_that_networks_surpass_is_warned_of(line):
+    objects = rods(line, sizes=np.geomspace(0.6, 28.0, 10), turns_deg=[0.0])
+    measured = measured_sizes(line, objects, np.random.default_rng(3), scatter=0.0, error=0.05)
+    found = fit_efficiency(line, measured[:5], objects, observer=Observer(false_alarm_rate=0.05))
+    assert found.observer.efficiency < 1 and found.warnings == ()
+    above = dataclasses.replace(found, observer=dataclasses.replace(found.observer, efficiency=2.8))
+    (told,) = above.warnings
+    assert told.startswith("efficiency 2.8 (95 %: ") and "is above 1: networks see more than" in told
+    answer = CalibratedObserver(efficiency=above)
+    assert answer.to_dict()["warnings"] == [told] and told in repr(answer)
+    blind = dataclasses.replace(above, observer=dataclasses.replace(above.observer, detector="npw", image="low"))
+    assert blind.warnings == ()
 
 
 def references_of(attributes):

@@ -97,7 +97,11 @@ class CalibratedObserver(Result):
         from ..observers.efficiency_io import efficiency_to_mapping
 
         found: dict[str, Any] = plain(
-            {**efficiency_to_mapping(self.efficiency), "left_out_rms": self.efficiency.left_out_rms}
+            {
+                **efficiency_to_mapping(self.efficiency),
+                "left_out_rms": self.efficiency.left_out_rms,
+                "warnings": self.efficiency.warnings,
+            }
         )
         return found
 
@@ -131,6 +135,7 @@ class CalibratedObserver(Result):
             title=title,
             header=("a90 of networks", "predicted", "95 % interval", "agrees within both errors", "setting"),
             rows=rows,
+            notes=tuple(f"note: {line}" for line in one.warnings),
         )
 
 
@@ -244,6 +249,8 @@ def observe(
         warnings.append(
             "not calibrated to networks: no interval; `calibrate_observer` brings it to the networks of a sweep"
         )
+    else:
+        warnings += efficiency.warnings
     largest = float(objects.size.max())
     rows = []
     for number, pair in enumerate(pairs):
@@ -316,13 +323,13 @@ def calibrate_observer(
 
     Args:
         twin: the line that the sweep was of.
-        sweep: folder of a finished `sweep` with reference images and four settings or more that have an a90.
+        sweep: folder of a finished `sweep` with reference images and four settings or more that have an a90 with its interval.
         product_material, foreign_material: of the references; None: as the sweep's campaign says.
         detector, image: as of `observe`.
         false_alarm_rate: None: the mean over the sweep's settings.
 
     Raises:
-        InputError: no such sweep, one of described products, or fewer than four settings with an a90.
+        InputError: no such sweep, one of described products, or fewer than four settings with an a90 and its interval.
 
     Example:
         >>> observer = rt.calibrate_observer("twin.h5", "sweep")  # doctest: +SKIP

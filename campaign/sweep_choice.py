@@ -31,14 +31,15 @@ def paces(rows: Sequence[Row]) -> list[float]:
 
 
 def a90_for_front(row: Row, most_false_alarms: float | None) -> float | None:
-    """a90 with which a row stands for the front: of its networks, else what an observer expects of them.
+    """a90 with which a row stands for the front: of its networks, or what an observer expects of a setting that was not trained.
 
     None: not known, a setting that cannot be, or networks with more false alarms than allowed.
     """
-    if not row["feasible"] or (row["trained"] and not _alarms_allowed(row, most_false_alarms)):
+    if not row["feasible"]:
         return None
-    value = row["a90"] if row["a90"] is not None else (row["predicted"] or {}).get("value")
-    return None if value is None else float(value)
+    if row["trained"]:
+        return float(row["a90"]) if takes_part(row, most_false_alarms) else None
+    return float(row["predicted"]["value"]) if row["predicted"] else None
 
 
 def pareto_front(rows: Sequence[Row]) -> list[int]:
@@ -91,10 +92,8 @@ def choose(rows: Sequence[Row], *, goal: float | None, most_false_alarms: float 
 
 def takes_part(row: Row, most_false_alarms: float | None) -> bool:
     """Whether a row may be recommended: it has an a90, and no more false alarms than allowed."""
-    return row.get("a90") is not None and _alarms_allowed(row, most_false_alarms)
-
-
-def _alarms_allowed(row: Row, most_false_alarms: float | None) -> bool:
+    if row.get("a90") is None:
+        return False
     rate = row.get("false_alarm_rate")
     return most_false_alarms is None or (rate is not None and float(rate["value"]) <= most_false_alarms)
 

@@ -28,7 +28,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from .sweep_choice import pareto_front
 from .sweep_file import Requirement
 
 Row = Mapping[str, Any]
@@ -447,24 +446,20 @@ def decision_sentence(
 
 
 def front_of(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Settings that no other beats in a90, dose and pace together; a90 of networks, or what the observer expects of them."""
-    filled = [
-        {**row, "a90": row["a90"] if row["a90"] is not None else (row.get("predicted") or {}).get("value")}
-        if row["feasible"]
-        else {**row, "a90": None}
-        for row in rows
-    ]
-    return [
+    """The rows on the front (`pareto`), smallest a90 first; a90 of networks, or what the observer expects of them."""
+    front = [
         {
-            "setting": rows[number]["setting"],
-            "label": rows[number]["label"],
-            "a90": filled[number]["a90"],
-            "predicted": rows[number]["a90"] is None,
-            "throughput_per_s": rows[number]["throughput_per_s"],
-            "dose_uGy": rows[number]["dose_uGy"],
+            "setting": row["setting"],
+            "label": row["label"],
+            "a90": row["predicted"]["value"] if row["a90"] is None else row["a90"],
+            "predicted": row["a90"] is None,
+            "throughput_per_s": row["throughput_per_s"],
+            "dose_uGy": row["dose_uGy"],
         }
-        for number in sorted(pareto_front(filled), key=lambda number: float(filled[number]["a90"]))
+        for row in rows
+        if row["pareto"]
     ]
+    return sorted(front, key=lambda one: float(one["a90"]))
 
 
 def decide(
@@ -479,7 +474,7 @@ def decide(
     """The decision as sweep.json holds it.
 
     Args:
-        rows: of the sweep.
+        rows: of the sweep, those on the front marked `pareto`.
         requirement: what is asked for.
         verdicts: of each row.
         recommended: number of the row that is taken, or comes closest.

@@ -20,8 +20,8 @@ _POINTS: dict[str, tuple[str, Shape]] = {
     "recommended": (BEFORE, "square"),
     "on the front": (BEFORE, "circle"),
     "on the front, expected": (BEFORE, "diamond"),
-    "beaten in all three": (AFTER, "circle"),
-    "beaten in all three, expected": (QUIET, "diamond"),
+    "not on the front": (AFTER, "circle"),
+    "not on the front, expected": (QUIET, "diamond"),
 }
 
 
@@ -142,7 +142,7 @@ def _screening_text(screening: Mapping[str, Any]) -> str:
         f" internal noise of {who['internal_noise']:.3g}; settings left out of its calibration are met to"
         f" {100 * screening['left_out_rms']:.0f} % (rms, the networks' own error included)."
     )
-    return text
+    return " ".join([text, *(f"Its {warning}." for warning in screening["warnings"])])
 
 
 def charts_of_both_sizes(row: Mapping[str, Any], answer: Mapping[str, Any]) -> list[Chart]:
@@ -211,7 +211,7 @@ def expected_charts(answer: Mapping[str, Any]) -> dict[str, Chart]:
             at = row[name]["value"] if isinstance(row[name], Mapping) else row[name]
             if a90 is None or at is None or not row["feasible"]:
                 continue
-            best = "on the front" if row["setting"] in front else "beaten in all three"
+            best = "on the front" if row["setting"] in front else "not on the front"
             kind = "recommended" if row["recommended"] else best if row["a90"] is not None else f"{best}, expected"
             groups[kind].append((factor * at, a90, str(row["label"])))
         marks: list[Any] = [Rule(at=required["size"], colour="#111111", label="asked for")]

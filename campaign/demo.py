@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..files import only_one
+from ..files import only_one, remove_parts
 from ..generator.line.twin import Z95
 from .chain import Chain, Run, Tell, claim_folder
 from .demo_gap import GapPlan, run_gap
@@ -128,6 +128,7 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
     """
     claim_folder(directory, asdict(plan), what="a demo")
     with only_one(directory, "a demo"):
+        remove_parts(directory)
         chain = Chain(directory=directory, run=run, tell=tell)
         exposures = [1000.0, *plan.exposures_ms]
         line = measure_line(chain, plan.line)

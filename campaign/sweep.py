@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import FitError, InputError, RaytwinError
-from ..files import only_one, whole_file, write_json
+from ..files import only_one, remove_parts, whole_file, write_json
 from ..generator.twins.twin_io import read_twin
 from ..observers import write_efficiency
 from ._plain import digest, plain, read_object
 from .decision import NO_LOOKS, Change, Looks, Verdict, decide, judge_row
-from .sweep_choice import choose, indistinct, pareto_front, sentence, takes_part
+from .sweep_choice import a90_for_front, choose, indistinct, pareto_front, sentence, takes_part
 from .sweep_file import Campaign, CurveOptions, Pair
 from .sweep_runners import Runner
 from .sweep_settings import Outlook, Scout, keep_best, labels_of
@@ -154,6 +154,7 @@ def run_sweep(
     progress = progress or Progress()
     _claim(directory)
     with only_one(directory, "a sweep"):
+        remove_parts(directory)
         found = tuple(outlooks) if outlooks is not None else look_ahead(campaign)
         basis = basis_of(campaign, version=version)
         if another := _answer_of_another(directory, campaign, basis):
@@ -222,7 +223,10 @@ def _screened(
             progress.tell(f"{len(chosen)} undecided settings are trained next; {left} others wait for the observer")
         work(chosen, before=len(asked))
         asked += chosen
-    return screened_rows(screen, rows, asked)
+    screened = screened_rows(screen, rows, asked)
+    for text in screened.answer["warnings"]:
+        progress.tell(f"warning: {text}")
+    return screened
 
 
 def seconds_of(directory: Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -445,7 +449,7 @@ def _answer(
             )
             row["verdict"] = verdicts[-1].verdict
     choice = choose(rows, goal=goal, most_false_alarms=most)
-    front = set(pareto_front([row if takes_part(row, most) else {**row, "a90": None} for row in rows]))
+    front = set(pareto_front([{**row, "a90": a90_for_front(row, most)} for row in rows]))
     for number, row in enumerate(rows):
         ratio, alike = None, False
         if choice.best is not None and number != choice.best and row["a90"] is not None:

@@ -30,6 +30,18 @@ def paces(rows: Sequence[Row]) -> list[float]:
     return [float(row.get(name) or 0.0) for row in rows]
 
 
+def a90_for_front(row: Row, most_false_alarms: float | None) -> float | None:
+    """a90 with which a row stands for the front: of its networks, or what an observer expects of a setting that was not trained.
+
+    None: not known, a setting that cannot be, or networks with more false alarms than allowed.
+    """
+    if not row["feasible"]:
+        return None
+    if row["trained"]:
+        return float(row["a90"]) if takes_part(row, most_false_alarms) else None
+    return float(row["predicted"]["value"]) if row["predicted"] else None
+
+
 def pareto_front(rows: Sequence[Row]) -> list[int]:
     """Numbers of the rows that no other beats: none has as small an a90, as low a dose and as high a pace, and one of them better.
 

@@ -24,6 +24,7 @@ LINKS = ("cloglog", "loglog", "logit", "probit")
 METHODS = ("auto", "ml", "firth")
 PAIRS = ("in_turn", "at_once")
 KEEP_OF = ("throughput", "all")
+MATERIALS = ("product_material", "foreign_material")
 MOST_SETTINGS = 10_000
 _START_STEPS = 240  # of random weights, on the references
 _FEWEST_TO_CALIBRATE = 4  # of settings, for the two numbers of an observer: observers.efficiency
@@ -262,7 +263,7 @@ def read_campaign(path: str | os.PathLike[str]) -> Campaign:
             received=sum(shares.values()),
             expected="less than 1 together",
         )
-    materials = {name: _material(words, name, default) for name, default in _MATERIALS.items()}
+    product_material, foreign_material = _materials(words, [references, test_references])
     seed = words.whole("seed", 1, least=0)
     keep_best = words.whole("keep_best", None, least=1)
     keep_best_of = words.choice("keep_best_of", "throughput", KEEP_OF)
@@ -281,8 +282,8 @@ def read_campaign(path: str | os.PathLike[str]) -> Campaign:
         reference_setting=(setting_from_text(low), setting_from_text(high)) if low else None,
         test_share=shares["test_share"],
         validation_share=shares["validation_share"],
-        product_material=materials["product_material"],
-        foreign_material=materials["foreign_material"],
+        product_material=product_material,
+        foreign_material=foreign_material,
         seed=seed,
         settings=settings,
         timing=_timing(tables["line"]),
@@ -301,7 +302,6 @@ def read_campaign(path: str | os.PathLike[str]) -> Campaign:
 
 
 _SHARES = {"test_share": 0.3, "validation_share": 0.15}
-_MATERIALS = {"product_material": "chicken_breast", "foreign_material": "rib_bone"}
 
 
 def _check_together(campaign: Campaign, size_of_requirement: str) -> None:
@@ -557,10 +557,33 @@ def _twin_file(words: _Words, folder: Path) -> Path:
     )
 
 
-def _material(words: _Words, name: str, default: str) -> str:
+def _materials(words: _Words, files: Sequence[Path | None]) -> tuple[str, str]:
+    """Materials of product and foreign object: those of the campaign, else those that the reference images state, else the usual."""
+    from ..acquisition.dataset_io import read_dataset
+    from ..generator.datasets.reference_materials import USUAL_MATERIALS, materials_of_references
+
+    product, foreign = (_material(words, name) for name in MATERIALS)
+    for file in files:
+        if file is None or file.suffix.lower() == ".toml":
+            continue
+        try:
+            dataset = read_dataset(file)
+        except InputError:
+            continue  # refused where its images are opened
+        with dataset:
+            product, foreign = materials_of_references(
+                dataset, product_material=product, foreign_material=foreign, where=f"{words.where}, "
+            )
+    return product or USUAL_MATERIALS[0], foreign or USUAL_MATERIALS[1]
+
+
+def _material(words: _Words, name: str) -> str | None:
+    """The material that a word names; None where the word is not there."""
     from ..materials import material_from_name
 
-    material = words.text(name, default)
+    if name not in words:
+        return None
+    material = words.text(name, None)
     with _placed(f"{words.where}, {name}"):
         material_from_name(material)
     return material

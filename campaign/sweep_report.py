@@ -34,7 +34,7 @@ _KINDS: dict[str, tuple[str, Shape]] = {
 _FRONTS: dict[str, tuple[str, Shape]] = {
     "recommended": (AFTER, "circle"),
     "no other beats it in a90, dose and throughput": (BEFORE, "diamond"),
-    "beaten by another": (QUIET, "square"),
+    "not on the front": (QUIET, "square"),
 }
 
 

@@ -270,7 +270,7 @@ class Screen:
     """
 
     def __init__(self, campaign: Campaign, tests: Path, outlooks: Sequence[Outlook]) -> None:
-        from ..observers import LineImages, Observer, materials_seen, read_efficiency, sight_of_references
+        from ..observers import LineImages, Observer, check_materials, read_efficiency, sight_of_references
 
         screening = campaign.screening or Screening()
         self.campaign, self._screening = campaign, screening
@@ -285,7 +285,11 @@ class Screen:
                     received=f"an observer calibrated for {self.efficiency.size_name}",
                     expected=f"one for {campaign.curve.size}, the size of this campaign",
                 )
-            materials_seen(self.efficiency, campaign.product_material, campaign.foreign_material)
+            check_materials(
+                self.efficiency,
+                product_material=campaign.product_material,
+                foreign_material=campaign.foreign_material,
+            )
         calibrated = None if self.efficiency is None else self.efficiency.observer
         detector = screening.detector if calibrated is None else calibrated.detector
         self.line: LineImages = LineImages(read_twin(campaign.twin))
@@ -447,6 +451,18 @@ def outlooks_of_rows(rows: Sequence[Mapping[str, Any]]) -> list[Outlook]:
     ]
 
 
+def plan_warnings(campaign: Campaign, outlooks: Sequence[Outlook]) -> tuple[str, ...]:
+    """Why no observer can be calibrated, as far as it is known before training."""
+    from ..observers.efficiency import FEWEST_SETTINGS
+
+    kept = sum(one.kept for one in outlooks)
+    if campaign.screening is None or campaign.screening.observer is not None or kept >= FEWEST_SETTINGS:
+        return ()
+    return (
+        f"[screening]: {kept} settings can be trained, and an observer is calibrated on {FEWEST_SETTINGS} or more: none comes of it",
+    )
+
+
 def screened_rows(screen: Screen, rows: Mapping[str, dict[str, Any]], asked: Sequence[str]) -> Screened:
     """What the observer expects, written into the rows of all settings, and why those that were not trained were not."""
     from ..observers.efficiency_io import efficiency_to_mapping
@@ -480,6 +496,7 @@ def screened_rows(screen: Screen, rows: Mapping[str, dict[str, Any]], asked: Seq
             ),
             "left_out_rms": None if efficiency is None else efficiency.left_out_rms,
             "why_none": screen.why_none,
+            "warnings": [] if efficiency is None else list(efficiency.warnings),
         },
     )
 

@@ -21,7 +21,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..acquisition.dataset_io import Dataset, concatenate_datasets, read_dataset, write_dataset, write_selected
+from ..acquisition.dataset_io import (
+    Dataset,
+    DatasetRow,
+    concatenate_datasets,
+    read_dataset,
+    write_dataset,
+    write_selected,
+)
 from ..acquisition.pairs import split_by_product
 from ..acquisition.setting import setting_from_text
 from ..errors import FileFormatError, InputError, RaytwinError
@@ -191,11 +198,29 @@ def check_references(campaign: Campaign) -> None:
     """Refuse references that leave nothing to learn from or to try on; nothing is written.
 
     Raises:
-        InputError: files of another kind, no products left to learn from or to try on, no foreign objects among them.
+        InputError: files of another kind, no products left to learn from or to try on, no foreign objects among them, or fewer to
+            try on than an observer needs that screens.
     """
-    if not campaign.described:
-        with ExitStack() as stack:
-            _deal(campaign, stack)
+    if campaign.described:
+        return
+    with ExitStack() as stack:
+        dealt = _deal(campaign, stack)
+        if campaign.screening is not None:
+            _check_objects(dealt.tests.path, [dealt.tests.rows[number] for number in dealt.tried])
+
+
+def _check_objects(path: str, rows: Sequence[DatasetRow]) -> None:
+    """Refuse rows that hold fewer foreign objects than an observer reads."""
+    from ..observers.objects import FEWEST_OBJECTS, is_readable
+
+    found = sum(is_readable(row) for row in rows)
+    if found < FEWEST_OBJECTS:
+        raise InputError(
+            path,
+            received=f"{found} foreign objects of known contrast above 0 to try networks on",
+            expected=f"{FEWEST_OBJECTS} or more, for the observer of [screening]",
+            remedy="more products, or another test_share",
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

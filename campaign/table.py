@@ -26,7 +26,7 @@ import numpy as np
 
 from ..acquisition.dataset_io import read_dataset
 from ..errors import InputError
-from ..files import only_one, whole_file
+from ..files import only_one, remove_parts, whole_file
 from ._plain import canonical, plain, read_object
 from .chain import Chain, Run, Tell, claim_folder
 from .lab_line import REFERENCE_MS, LabLine, measure_line, write_generated, write_measured
@@ -180,6 +180,7 @@ def run_table(
 
     claim_folder(directory, plain(asdict(plan)), what="a table")
     with only_one(directory, "a table"):
+        remove_parts(directory)
         load_torch().set_num_threads(1)  # hits and misses do not depend on the machine's cores
         chain = Chain(directory=directory, run=run, tell=tell)
         exposures = (REFERENCE_MS, *sorted(plan.line.exposures_ms, reverse=True))

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .detectors import DETECTORS as DETECTORS
     from .efficiency import Efficiency as Efficiency
     from .efficiency import MeasuredSize as MeasuredSize
+    from .efficiency import check_materials as check_materials
     from .efficiency import fit_efficiency as fit_efficiency
     from .efficiency import materials_seen as materials_seen
     from .efficiency import predicted_sizes as predicted_sizes
@@ -58,6 +59,7 @@ _HOME = {
     "Observer": "observe",
     "ProductTexture": "texture",
     "Shape": "objects",
+    "check_materials": "efficiency",
     "factors_of_changes": "changes",
     "fit_efficiency": "efficiency",
     "frequency_bins": "frequencies",

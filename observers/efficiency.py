@@ -22,8 +22,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..acquisition.dataset_io import Dataset
 from ..acquisition.setting import Setting
 from ..errors import FitError, InputError
+from ..generator.datasets.reference_materials import USUAL_MATERIALS, materials_of_references
 from ..generator.line.twin import Z95
 from ..materials import material_from_name
 from .line_images import LineImages
@@ -35,7 +37,6 @@ FloatArray = NDArray[np.float64]
 Pair = tuple[Setting, Setting]
 
 FEWEST_SETTINGS = 4
-USUAL_MATERIALS = ("chicken_breast", "rib_bone")  # of product and foreign object, where nobody says
 _PRIOR_LOG_EFFICIENCY = 1.5
 _PRIOR_NOISE = 2.0
 _WIDEST = (6.0, 8.0)  # of the first grid: four standard deviations of the priors
@@ -107,32 +108,69 @@ class Efficiency:
         return len(self.left_out) - 2
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to know before the numbers are used: an ideal observer that networks surpass."""
+        efficiency = self.observer.efficiency
+        if self.observer.detector != "ideal" or efficiency <= 1:
+            return ()
+        reach = math.exp(Z95 * math.sqrt(self.covariance[0][0]))
+        return (
+            f"efficiency {efficiency:.3g} (95 %: {efficiency / reach:.2g} to {efficiency * reach:.2g}) is above 1:"
+            " networks see more than the observer's image and noise hold",
+        )
+
+    @property
     def left_out_rms(self) -> float:
         """Root mean square of ln(measured / predicted) over settings that were left out."""
         return math.sqrt(float(np.mean([math.log(one.measured / one.predicted) ** 2 for one in self.left_out])))
 
 
-def materials_seen(
-    efficiency: Efficiency | None, product_material: str | None, foreign_material: str | None
-) -> tuple[str, str]:
-    """Materials of product and foreign object: those given, else the calibrated observer's, else the usual ones.
+def check_materials(efficiency: Efficiency, *, product_material: str, foreign_material: str, where: str = "") -> None:
+    """Refuse materials other than those that the observer was calibrated with; a file that does not say its own takes any.
+
+    Args:
+        efficiency: of the observer.
+        product_material, foreign_material: that it is to look at.
+        where: what comes before the argument's name in messages.
 
     Raises:
-        InputError: others than those that the observer was calibrated with.
+        InputError: another material.
     """
-    given = {"product_material": product_material, "foreign_material": foreign_material}
-    found = []
-    for (name, wanted), usual in zip(given.items(), USUAL_MATERIALS, strict=True):
-        own: str | None = None if efficiency is None else getattr(efficiency, name)
-        if own is not None and wanted is not None and material_from_name(own) != material_from_name(wanted):
+    for name, own, seen in (
+        ("product_material", efficiency.product_material, product_material),
+        ("foreign_material", efficiency.foreign_material, foreign_material),
+    ):
+        if own is not None and material_from_name(own) != material_from_name(seen):
             raise InputError(
-                name,
-                received=wanted,
+                f"{where}{name}",
+                received=seen,
                 expected=f"{own}, with which the observer was calibrated",
                 remedy="calibrate it to networks that looked at the other one",
             )
-        found.append(wanted or own or usual)
-    return found[0], found[1]
+
+
+def materials_seen(
+    dataset: Dataset,
+    efficiency: Efficiency | None,
+    *,
+    product_material: str | None = None,
+    foreign_material: str | None = None,
+) -> tuple[str, str]:
+    """Names of the materials of product and foreign object: those asked for, else those that the references state, else those of
+    the calibrated observer, else the usual ones.
+
+    Raises:
+        InputError: those asked for, of the references and of the observer differ, or the references state several.
+    """
+    usual = USUAL_MATERIALS
+    if efficiency is not None:
+        usual = efficiency.product_material or usual[0], efficiency.foreign_material or usual[1]
+    product, foreign = materials_of_references(
+        dataset, product_material=product_material, foreign_material=foreign_material, usual=usual
+    )
+    if efficiency is not None:
+        check_materials(efficiency, product_material=product, foreign_material=foreign, where=f"{dataset.path}, ")
+    return product, foreign
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -235,7 +273,7 @@ def fit_efficiency(
             "measured a90",
             received=f"{len(known)} settings with an a90 and its interval",
             expected=f"{FEWEST_SETTINGS} or more",
-            remedy="train networks at more settings, at some with less noise",
+            remedy="train three networks or more, at more settings, at some with less noise",
         )
     pairs = [one.pair for one in known]
     prepared = PreparedSettings(line, pairs, objects, observer=observer, texture=texture)
@@ -326,7 +364,7 @@ def predicted_sizes(
             received=f"sizes as {objects.size_name}",
             expected=f"{efficiency.size_name}, by which the observer was calibrated",
         )
-    materials_seen(efficiency, objects.product_material, objects.foreign_material)
+    check_materials(efficiency, product_material=objects.product_material, foreign_material=objects.foreign_material)
     observer = efficiency.observer
     covariance = np.array(efficiency.covariance)
     quantile = _quantile(len(efficiency.left_out))

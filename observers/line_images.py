@@ -187,12 +187,13 @@ class LineImages:
             pair, (product_material, foreign_material), product_mm=flat[0], object_mm=flat[1], displaces=True
         ).reshape(thickness.shape)
         contrasts *= math.copysign(1.0, float(np.median(contrasts[:, -1])))
-        if not np.all(np.max(contrasts, axis=1) >= references.contrast):
+        too_large = references.contrast > np.max(contrasts, axis=1)
+        if too_large.any():
             raise InputError(
                 "contrasts of the references",
-                received=f"up to {references.contrast.max():.3g}",
+                received=f"up to {references.contrast[too_large].max():.3g} of {too_large.sum()} of {too_large.size} objects",
                 expected=f"what {foreign_material} can make in {product_material}",
-                remedy="state the materials (product_material, foreign_material)",
+                remedy="state other materials, or leave out objects where the product's thickness changes, as at its edge",
             )
         object_mm = np.array(
             [

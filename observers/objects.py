@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.contrast import PRODUCT_THRESHOLD, dilations_for_pixel
-from ..acquisition.dataset_io import Dataset
+from ..acquisition.dataset_io import Dataset, DatasetRow
 from ..errors import InputError
 from .frequencies import FrequencyBins, frequency_bins, object_spectrum
 
@@ -20,6 +20,7 @@ FloatArray = NDArray[np.float64]
 
 TURNS_DEG = (0.0, 30.0, 60.0, 90.0)
 LARGEST_PATCH_PX = 512
+FEWEST_OBJECTS = 5  # of references
 _SMALLEST_PATCH_PX = 32
 _FINE = 8  # points a side of each pixel, of a shape as wide as one; more of thinner ones
 
@@ -69,6 +70,11 @@ class ReferenceObjects:
     setting: str
 
 
+def is_readable(row: DatasetRow) -> bool:
+    """Whether a row has a foreign object whose contrast says how thick it is."""
+    return bool(row.foreign_object) and math.isfinite(row.contrast) and row.contrast > 0
+
+
 def objects_of_references(dataset: Dataset, *, pixel_mm: float) -> ReferenceObjects:
     """Masks, contrasts and surroundings of the foreign objects of a dataset, those of known contrast above 0.
 
@@ -85,7 +91,7 @@ def objects_of_references(dataset: Dataset, *, pixel_mm: float) -> ReferenceObje
     names, contrast, size_mm, ring_log, masks, area = [], [], [], [], [], []
     settings = set()
     for number, row in enumerate(dataset.rows):
-        if not row.foreign_object or not (math.isfinite(row.contrast) and row.contrast > 0):
+        if not is_readable(row):
             continue
         mask, (low, high) = dataset.foreign_object_masks(number), dataset.images(number)
         product = dataset.product_masks(number)
@@ -99,11 +105,11 @@ def objects_of_references(dataset: Dataset, *, pixel_mm: float) -> ReferenceObje
         ring_log.append(float(high[ring].mean()))
         masks.append(mask[find_objects(mask.astype(np.int8))[0]])
         area.append(float((product if product.any() else low > PRODUCT_THRESHOLD).sum()))
-    if len(names) < 5:
+    if len(names) < FEWEST_OBJECTS:
         raise InputError(
             dataset.path,
             received=f"{len(names)} foreign objects with a mask and a contrast above 0",
-            expected="5 or more",
+            expected=f"{FEWEST_OBJECTS} or more",
         )
     if len(settings) > 1:
         raise InputError(dataset.path, received=f"images of {len(settings)} settings", expected="one setting")

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from ..acquisition.dataset_io import Dataset
 from ..acquisition.setting import Setting, setting_from_text
-from ..errors import InputError
+from ..errors import FileFormatError, InputError
 from .line_images import TEXTURED, LineImages
 from .objects import ForeignObjects, objects_of_references
 from .texture import ProductTexture, texture_of_references
@@ -51,6 +51,7 @@ def sight_of_references(
 
     Raises:
         InputError: references that do not say their setting, or without objects of known contrast; no texture where `image` shows it.
+        FileFormatError: images that cannot be read or hold values that are not finite.
     """
     found = objects_of_references(dataset, pixel_mm=line.pixel_mm)
     low, semicolon, high = found.setting.partition(";")
@@ -64,6 +65,8 @@ def sight_of_references(
     if image is None or image in TEXTURED:
         try:
             texture = texture_of_references(dataset, line, pair=pair, material=product_material)
+        except FileFormatError:
+            raise  # a file that cannot be used, whatever the image
         except InputError as error:
             if image is not None:
                 raise

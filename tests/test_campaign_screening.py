@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -23,12 +24,13 @@ from raytwin.campaign.sweep_screening import (
     still_to_gain,
 )
 from raytwin.campaign.sweep_trial import basis_of, prepare_references
-from raytwin.errors import InputError
+from raytwin.errors import FileFormatError, InputError
 from raytwin.explore.seen_size import Eye, read_networks_observer
 from raytwin.explore.state import first_state
 from raytwin.files import sha256_of_file
 from raytwin.generator.twins.twin_io import read_twin
-from raytwin.observers import observe_settings
+from raytwin.observers import Efficiency, Observer, observe_settings, write_efficiency
+from raytwin.observers.efficiency import LeftOut
 
 CAMPAIGN = """
 twin = "twin.h5"
@@ -47,6 +49,9 @@ start_steps = 0
 [screening]
 round = 3
 """
+
+
+PAIR = tuple(f"kv={kV},power_w=40,exposure_ms=50,filter=Cu:0.05" for kV in (40, 90))
 
 
 @pytest.fixture(scope="module")
@@ -187,6 +192,7 @@ def test_the_observer_of_a_sweep_is_kept_and_says_the_same_elsewhere(line, ahead
     # and a sweep with it calibrates on no setting
     again, networks = swept(line, ahead, tmp_path / "again", text=(line / "plan.toml").read_text())
     assert again["screening"]["calibrating"] == [] and again["recommended"] in networks.trained
+    assert {one["setting"] for one in again["decision"]["front"]} == set(again["pareto"])
 
 
 def test_bytes_depend_neither_on_the_order_nor_on_a_stop(line, ahead, tmp_path):
@@ -329,3 +335,83 @@ def test_references_whose_texture_cannot_be_read_are_named(line):
     answer = rt.observe(read_twin(line / "twin.h5"), pair, references=line / "references.h5")
     assert answer.observer["image"] == "residual"
     assert any("texture cannot be read, so the residual image" in line for line in answer.warnings)
+
+
+def stating(line, folder, **attributes):
+    """The line's references with attributes of their own."""
+    path = folder / "stating.h5"
+    path.write_bytes((line / "references.h5").read_bytes())
+    with h5py.File(path, "a") as file:
+        file.attrs.update(attributes)
+    return path
+
+
+def test_references_are_looked_at_as_what_they_state_to_be(line, tmp_path):
+    twin, pair = read_twin(line / "twin.h5"), PAIR
+    meat = rt.observe(twin, pair, references=line / "references.h5")
+    silent = stating(line, tmp_path)
+    with h5py.File(silent, "a") as file:
+        del file.attrs["description"]
+    asked = rt.observe(twin, pair, references=silent, product_material="water", foreign_material="glass")
+    told = stating(line, tmp_path, product_material="water", foreign_material="glass")
+    assert rt.observe(twin, pair, references=told).rows == asked.rows != meat.rows
+    with pytest.raises(InputError, match=r"expected water, which .*states"):
+        rt.observe(twin, pair, references=told, product_material="chicken_breast")
+    campaign = CAMPAIGN.replace("references.h5", str(told))
+    (line / "stating.toml").write_text(campaign)
+    found = read_campaign(line / "stating.toml")
+    assert (found.product_material, found.foreign_material) == ("water", "glass")
+    (line / "stating.toml").write_text(f'product_material = "Al"\n{campaign}')
+    with pytest.raises(InputError, match=r"stating.toml, product_material: got Al; expected water, which .*stating.h5"):
+        read_campaign(line / "stating.toml")
+    setting = {"low": pair[0].replace("kv=40", "kv=50"), "high": pair[1]}
+    made = rt.generate(twin, told, n=1, seed=1, **setting)
+    assert (made.attributes["product_material"], made.attributes["foreign_material"]) == ("water", "glass")
+
+
+def test_an_observer_of_other_materials_is_refused_wherever_it_is_used(line, ahead, tmp_path):
+    left_out = LeftOut(pair=ahead[0].pair, measured=1.0, predicted=1.0, low=0.9, high=1.1, log_sd=0.1)
+    jar = Efficiency(
+        observer=Observer(),
+        covariance=((0.1, 0.0), (0.0, 0.1)),
+        unit=0.01,
+        scatter=0.0,
+        left_out=(left_out,) * 4,
+        size_name="contrast",
+        product_material="water",
+        foreign_material="glass",
+    )
+    write_efficiency(tmp_path / "observer.json", jar)
+    twin, references = read_twin(line / "twin.h5"), line / "references.h5"
+    (line / "jar.toml").write_text(CAMPAIGN.replace("round = 3", f'observer = "{tmp_path / "observer.json"}"'))
+    for call in (
+        lambda: rt.observe(twin, PAIR, references=references, calibrated=jar),
+        lambda: read_networks_observer(str(tmp_path / "observer.json"), str(references), twin),
+        lambda: Screen(read_campaign(line / "jar.toml"), references, ahead),
+    ):
+        with pytest.raises(InputError, match="got chicken_breast; expected water, with which the observer"):
+            call()
+
+
+def test_references_that_are_not_finite_are_refused(line, tmp_path):
+    path = stating(line, tmp_path)
+    with h5py.File(path, "a") as file:
+        file["images"][1, 0, 30:34, 30:34] = np.nan
+    with pytest.raises(FileFormatError, match="a value that is not finite"):
+        rt.observe(read_twin(line / "twin.h5"), PAIR, references=path)
+
+
+def test_what_keeps_an_observer_from_being_calibrated_is_said_before_training(line):
+    fewer = CAMPAIGN.replace("[4, 6, 9, 14, 20, 30, 45, 70]", "[20]")
+    (line / "fewer.toml").write_text(fewer)
+    plan = rt.sweep(line / "fewer.toml", plan_only=True)
+    (told,) = plan.warnings
+    assert told.startswith("[screening]: 3 settings can be trained, and an observer is calibrated on 4 or more")
+    assert told in repr(plan) and plan.to_dict()["warnings"] == [told]
+    (line / "fewer.toml").write_text(fewer.replace("[screening]\nround = 3\n", ""))
+    assert rt.sweep(line / "fewer.toml", plan_only=True).warnings == ()
+    (line / "fewer.toml").write_text(CAMPAIGN.replace("test_share = 0.4", "test_share = 0.15"))
+    with pytest.raises(
+        InputError, match=r"foreign objects of known contrast above 0 to try networks on; expected 5 or"
+    ):
+        rt.sweep(line / "fewer.toml", plan_only=True)

@@ -342,7 +342,10 @@ def test_a_table_that_was_cut_short_is_made_again(line, whole, tmp_path):
     spy = Spy(Here())
     (folder / "sweep.json").write_text("{")
     next((folder / "settings").glob("*_50ms_*/seconds.json")).write_text("")
+    # what a process that was ended had begun to write
+    (hits.parent / ".train_drawn.h5.abcd1234.part").write_bytes(b"half")
     sweep(campaign, folder, spy)
+    assert not list(folder.rglob(".*.part"))
     assert len(spy.asked) == 1
     assert answers_of(folder) == answers_of(whole[0])
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from raytwin.acquisition.setting import Filter, setting_from_text
+from raytwin.api.observers import CalibratedObserver
 from raytwin.errors import FileFormatError, InputError
 from raytwin.generator.predictions.contrast import SlabContrasts
 from raytwin.generator.spread.psf import whole_spectrum
@@ -362,15 +364,52 @@ def test_a_calibrated_observer_is_read_back_as_written(line, tmp_path):
         fit_efficiency(line, measured[:3], objects, observer=Observer())
 
 
+def test_an_ideal_observer_that_networks_surpass_is_warned_of(line):
+    objects = rods(line, sizes=np.geomspace(0.6, 28.0, 10), turns_deg=[0.0])
+    measured = measured_sizes(line, objects, np.random.default_rng(3), scatter=0.0, error=0.05)
+    found = fit_efficiency(line, measured[:5], objects, observer=Observer(false_alarm_rate=0.05))
+    assert found.observer.efficiency < 1 and found.warnings == ()
+    above = dataclasses.replace(found, observer=dataclasses.replace(found.observer, efficiency=2.8))
+    (told,) = above.warnings
+    assert told.startswith("efficiency 2.8 (95 %: ") and "is above 1: networks see more than" in told
+    answer = CalibratedObserver(efficiency=above)
+    assert answer.to_dict()["warnings"] == [told] and told in repr(answer)
+    blind = dataclasses.replace(above, observer=dataclasses.replace(above.observer, detector="npw", image="low"))
+    assert blind.warnings == ()
+
+
+def references_of(attributes):
+    return SimpleNamespace(path="references.h5", attributes=attributes)
+
+
+def test_materials_are_those_that_the_references_state():
+    casting = {"description": '[[product]]\nmaterial = "Al"\n[[foreign_object]]\nmaterial = "air"\n'}
+    assert materials_seen(references_of(casting), None) == ("Al", "air")
+    assert materials_seen(references_of(casting), None, foreign_material="air") == ("Al", "air")
+    assert materials_seen(references_of(casting | {"product_material": "Mg"}), None) == ("Mg", "air")
+    assert materials_seen(references_of({}), None) == ("chicken_breast", "rib_bone")
+    with pytest.raises(InputError, match="product_material: got chicken_breast; expected Al, which references"):
+        materials_seen(references_of(casting), None, product_material="chicken_breast")
+    both = {"description": casting["description"] + '[[foreign_object]]\nmaterial = "glass"\n'}
+    assert materials_seen(references_of(both), None, foreign_material="glass") == ("Al", "glass")
+    with pytest.raises(InputError, match="of air and glass; expected one of these; state it"):
+        materials_seen(references_of(both), None)
+    with pytest.raises(FileFormatError, match="attribute description: got text that is not TOML"):
+        materials_seen(references_of({"description": "[["}), None)
+
+
 def test_a_calibrated_observer_looks_at_the_materials_it_was_calibrated_with(line):
     objects = rods(line, sizes=np.geomspace(0.6, 28.0, 10), turns_deg=[0.0])
     measured = measured_sizes(line, objects, np.random.default_rng(3), scatter=0.1, error=0.05)
     found = fit_efficiency(line, measured[:5], objects, observer=Observer(false_alarm_rate=0.05))
     jam = dataclasses.replace(found, product_material="C2.103H8.297O4.148@1.30", foreign_material="glass")
-    assert materials_seen(jam, None, None) == ("C2.103H8.297O4.148@1.30", "glass")
-    assert materials_seen(dataclasses.replace(found, product_material=None), None, None)[0] == "chicken_breast"
+    silent = references_of({})
+    assert materials_seen(silent, jam) == ("C2.103H8.297O4.148@1.30", "glass")
+    assert materials_seen(silent, dataclasses.replace(found, product_material=None))[0] == "chicken_breast"
     with pytest.raises(InputError, match="with which the observer was calibrated"):
-        materials_seen(jam, "chicken_breast", None)
+        materials_seen(silent, jam, product_material="chicken_breast")
+    with pytest.raises(InputError, match="got rib_bone; expected glass, with which the observer was calibrated"):
+        materials_seen(references_of({"foreign_material": "rib_bone"}), jam)
     with pytest.raises(InputError, match="with which the observer was calibrated"):
         predicted_sizes(line, PAIRS[:1], objects, jam)
 

@@ -136,7 +136,7 @@ def campaign() -> Schema:
     slabs.pop("foreign_object")
     words = {
         **dict.fromkeys(("twin", "references", "test_references", "reference_low", "reference_high"), TEXT),
-        **dict.fromkeys(sweep_file._MATERIALS, TEXT),
+        **dict.fromkeys(sweep_file.MATERIALS, TEXT),
         **dict.fromkeys(sweep_file._SHARES, SHARE),
         "seed": WHOLE,
         "keep_best": WHOLE,

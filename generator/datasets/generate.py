@@ -43,10 +43,10 @@ from ..references.transfer import (
 from ..references.two_material import TwoMaterialTables, tabulate_two_materials
 from ..spread.registration import estimate_shift_px, shift_image
 from .image_effects import ImageEffects
+from .reference_materials import USUAL_MATERIALS, stated_materials
 
 RECIPES = ("raytwin", "as_published")
-DEFAULT_PRODUCT = "chicken_breast"
-DEFAULT_FOREIGN = "rib_bone"
+DEFAULT_PRODUCT, DEFAULT_FOREIGN = USUAL_MATERIALS
 BAD_PIXELS = ("repaired", "measured")
 _GAIN_THICKNESSES_MM = np.array([0.0, 1, 2, 4, 7, 11, 16, 22, 30, 40, 55, 75, 100, 140])
 
@@ -723,7 +723,7 @@ def generate_dataset(
         "seed": seed,
         "recipe": recipe,
         "product_material": product_material,
-        "foreign_material": foreign_material if drawn.transfers else None,
+        "foreign_material": foreign_material if drawn.transfers or stated_materials(reference)[1] else None,
         BAD_PIXEL_MAP: bad_pixels,
         "registration_px": None if registration_px is None else str(registration_px),
         **effects_provenance(twin if recipe == "raytwin" else None),

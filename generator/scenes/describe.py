@@ -206,6 +206,20 @@ def read_description(path: str | os.PathLike[str]) -> Description:
     )
 
 
+def materials_named(text: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the materials of products and of foreign objects in a description's text, each once; maps may hold more.
+
+    Raises:
+        tomllib.TOMLDecodeError: no TOML.
+    """
+    tables = tomllib.loads(text)
+    products, foreign = (
+        tuple(dict.fromkeys(str(one["material"]) for one in tables.get(name, ()) if one.get("material")))
+        for name in ("product", "foreign_object")
+    )
+    return products, foreign
+
+
 def _check_words(table: Mapping[str, Any], known: Sequence[str] | Mapping[str, Any], *, where: str) -> None:
     for word in table:
         if word not in known:

@@ -14,6 +14,7 @@ from typing import Any
 from .errors import FileFormatError, InputError
 
 CSV_UTF8 = "CSV UTF-8"  # as spreadsheets name the encoding
+_PART = ".part"  # ending of a file that is not whole yet
 
 
 def given_path(value: object, *, expected: str, argument: str = "path") -> Path:
@@ -154,7 +155,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise InputError(str(path), received="a folder", expected="the name of a file to write")
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{final.name}.", suffix=".part", dir=final.parent)
+        handle, name = tempfile.mkstemp(prefix=f".{final.name}.", suffix=_PART, dir=final.parent)
         os.close(handle)
     except OSError as error:
         raise InputError(
@@ -171,6 +172,16 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, final)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_parts(folder: str | os.PathLike[str]) -> None:
+    """Remove what `whole_file` had begun in a folder, or in folders in it, when its process was ended.
+
+    Args:
+        folder: in which nothing else is being written, as after `only_one`.
+    """
+    for path in Path(folder).rglob(f".*.*{_PART}"):
+        path.unlink(missing_ok=True)
 
 
 def write_json(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:

@@ -30,10 +30,12 @@ _LABELS = {
 class SweepPlan(Result):
     """What is known of every setting of a campaign before training: rows with feasibility, dose, throughput, contrast to noise.
 
-    Where the campaign names a calibrated observer, also the a90 that it expects of networks.
+    Where the campaign names a calibrated observer, also the a90 that it expects of networks. `warnings` are of the campaign as a
+    whole; those of a setting stand in its row.
     """
 
     rows: tuple[Mapping[str, Any], ...]
+    warnings: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """What `raytwin sweep --plan --json` prints."""
@@ -43,6 +45,7 @@ class SweepPlan(Result):
                 "feasible": sum(bool(row["feasible"]) for row in self.rows),
                 "to_train": sum(bool(row["kept"]) for row in self.rows),
                 "rows": self.rows,
+                "warnings": self.warnings,
             }
         )
         return found
@@ -71,7 +74,12 @@ class SweepPlan(Result):
         expected = ["expected a90"] if seen else []
         answer = self.to_dict()
         title = f"{answer['settings']} settings, {answer['feasible']} feasible, {answer['to_train']} to train"
-        return Table(title=title, header=("setting", "feasible", "products/s", "CNR", *expected, "reason"), rows=rows)
+        return Table(
+            title=title,
+            header=("setting", "feasible", "products/s", "CNR", *expected, "reason"),
+            rows=rows,
+            notes=tuple(f"note: {line}" for line in self.warnings),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
@@ -304,8 +312,10 @@ def sweep(
 
 def _plan(campaign: "Campaign", telling: Telling) -> SweepPlan:
     from ..campaign.sweep import outlook_rows
+    from ..campaign.sweep_screening import plan_warnings
 
-    return SweepPlan(rows=tuple(plain(outlook_rows(campaign, _looked_at(campaign, telling)))))
+    outlooks = _looked_at(campaign, telling)
+    return SweepPlan(rows=tuple(plain(outlook_rows(campaign, outlooks))), warnings=plan_warnings(campaign, outlooks))
 
 
 def _looked_at(campaign: "Campaign", telling: Telling) -> "tuple[Outlook, ...]":

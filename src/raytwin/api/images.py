@@ -310,8 +310,8 @@ def generate(
     output: PathLike | None = None,
     recipe: str = "raytwin",
     split: str | None = None,
-    product_material: str = "chicken_breast",
-    foreign_material: str = "rib_bone",
+    product_material: str | None = None,
+    foreign_material: str | None = None,
     bad_pixels: str = "repaired",
     registration_px: tuple[float, float] | str | None = None,
     reference_low: "Setting | str | None" = None,
@@ -334,7 +334,8 @@ def generate(
         output: dataset file to write; None: arrays in memory.
         recipe: of the noise, `raytwin` or `as_published`.
         split: only references of this split.
-        product_material, foreign_material: what product and object are made of.
+        product_material, foreign_material: what product and object of references are made of; None: as their file states it, else
+            chicken_breast and rib_bone.
         bad_pixels: `repaired`, or `measured`: the counts hold the twin's bad pixels.
         registration_px: shift (rows, columns) of the references' high image, taken off; `estimate` finds it.
         reference_low, reference_high: settings of references that do not say.
@@ -364,8 +365,9 @@ def generate(
         check_new_folder(tiff)
     targets = as_setting(low), as_setting(high)
     known, told = twin_on_belt(as_twin(twin), targets)
-    material_from_name(product_material)
-    material_from_name(foreign_material)
+    for name in (product_material, foreign_material):
+        if name is not None:
+            material_from_name(name)
     if (reference_low is None) != (reference_high is None):
         raise InputError("reference_low and reference_high", received="one of the two", expected="both or neither")
     common: dict[str, Any] = {
@@ -395,18 +397,22 @@ def generate(
             )
         else:
             from ..generator.datasets.generate import generate_dataset
+            from ..generator.datasets.reference_materials import materials_of_references
 
             fallback = None
             if reference_low is not None and reference_high is not None:
                 fallback = (as_setting(reference_low), as_setting(reference_high))
             with _references(reference, known, Path(scratch)) as references:
+                product, foreign = materials_of_references(
+                    references, product_material=product_material, foreign_material=foreign_material
+                )
                 summary = generate_dataset(
                     known,
                     references,
                     path,
                     recipe=recipe,
-                    product_material=product_material,
-                    foreign_material=foreign_material,
+                    product_material=product,
+                    foreign_material=foreign,
                     bad_pixels=bad_pixels,
                     registration_px=registration_px,
                     split=split,

@@ -97,7 +97,11 @@ class CalibratedObserver(Result):
         from ..observers.efficiency_io import efficiency_to_mapping
 
         found: dict[str, Any] = plain(
-            {**efficiency_to_mapping(self.efficiency), "left_out_rms": self.efficiency.left_out_rms}
+            {
+                **efficiency_to_mapping(self.efficiency),
+                "left_out_rms": self.efficiency.left_out_rms,
+                "warnings": self.efficiency.warnings,
+            }
         )
         return found
 
@@ -131,6 +135,7 @@ class CalibratedObserver(Result):
             title=title,
             header=("a90 of networks", "predicted", "95 % interval", "agrees within both errors", "setting"),
             rows=rows,
+            notes=tuple(f"note: {line}" for line in one.warnings),
         )
 
 
@@ -172,7 +177,8 @@ def observe(
         sizes_mm: lengths to look at; None: from half a pixel to 120 pixels or the field's shorter side.
         displaces: the shape takes the product's place.
         references: in place of a shape: a dataset of low-noise images, whose objects are looked for (they take the product's place).
-        product_material, foreign_material: of the references; None: as `calibrated` was calibrated, else chicken_breast, rib_bone.
+        product_material, foreign_material: of the references; None: as their file states them, else as `calibrated` was
+            calibrated, else chicken_breast, rib_bone.
         size: of the references, `contrast` or `size_mm`; None: that of the calibrated observer, else `contrast`.
         detector: `ideal` (default), `hotelling`, `npw` or `npwe`; image: `residual` (default of a shape), `quotient`, `low`,
             `high` or `both` (default of references, where detector and texture of the product allow it).
@@ -180,7 +186,8 @@ def observe(
         calibrated: of `calibrate_observer`, or its file; it brings detector, image and false alarms along.
 
     Raises:
-        InputError: no settings, materials that are not known or not those of `calibrated`, neither product nor references, or both.
+        InputError: no settings, unknown materials or others than those of the references or of `calibrated`, neither product nor
+            references, or both.
 
     Source: ICRU Report 54 (1996); Barrett & Myers, Foundations of Image Science (2004), ch. 13.
 
@@ -194,7 +201,7 @@ def observe(
     import numpy as np
 
     from ..generator.predictions.contrast import check_pair
-    from ..observers import LineImages, Sight, materials_seen, observe_settings, predicted_sizes
+    from ..observers import LineImages, Sight, observe_settings, predicted_sizes
 
     pairs = _pairs(settings)
     line = LineImages(as_twin(twin))
@@ -219,12 +226,12 @@ def observe(
         )
         sight = Sight(objects=objects, image=observer.image, texture=None)
     else:
-        materials = materials_seen(efficiency, product_material, foreign_material)
         sight = _sight_of_file(
             line,
             references,
-            product_material=materials[0],
-            foreign_material=materials[1],
+            efficiency,
+            product_material=product_material,
+            foreign_material=foreign_material,
             size=size or (efficiency.size_name if efficiency is not None else "contrast"),
             detector=observer.detector,
             image=observer.image if efficiency is not None else image,
@@ -242,6 +249,8 @@ def observe(
         warnings.append(
             "not calibrated to networks: no interval; `calibrate_observer` brings it to the networks of a sweep"
         )
+    else:
+        warnings += efficiency.warnings
     largest = float(objects.size.max())
     rows = []
     for number, pair in enumerate(pairs):
@@ -314,13 +323,13 @@ def calibrate_observer(
 
     Args:
         twin: the line that the sweep was of.
-        sweep: folder of a finished `sweep` with reference images and four settings or more that have an a90.
+        sweep: folder of a finished `sweep` with reference images and four settings or more that have an a90 with its interval.
         product_material, foreign_material: of the references; None: as the sweep's campaign says.
         detector, image: as of `observe`.
         false_alarm_rate: None: the mean over the sweep's settings.
 
     Raises:
-        InputError: no such sweep, one of described products, or fewer than four settings with an a90.
+        InputError: no such sweep, one of described products, or fewer than four settings with an a90 and its interval.
 
     Example:
         >>> observer = rt.calibrate_observer("twin.h5", "sweep")  # doctest: +SKIP
@@ -359,6 +368,7 @@ def calibrate_observer(
     sight = _sight_of_file(
         line,
         tests,
+        None,
         product_material=product_material or own_product,
         foreign_material=foreign_material or own_foreign,
         size=size,
@@ -383,28 +393,32 @@ def calibrate_observer(
 def _sight_of_file(
     line: "LineImages",
     references: "Dataset | PathLike",
+    efficiency: "Efficiency | None",
     *,
-    product_material: str,
-    foreign_material: str,
+    product_material: str | None,
+    foreign_material: str | None,
     size: str,
     detector: str,
     image: str | None,
 ) -> "Sight":
-    """What an observer looks at in a dataset of references.
+    """What an observer, calibrated or not, looks at in a dataset of references.
 
     Raises:
-        InputError: references that do not say their setting, or without objects of known contrast.
+        InputError: references that do not say their setting, without objects of known contrast, or of other materials.
     """
-    from ..observers import sight_of_references
+    from ..observers import materials_seen, sight_of_references
 
     if size not in _UNITS:
         raise InputError("size", received=size, expected="contrast or size_mm")
     with dataset_of(references) as dataset:
+        product, foreign = materials_seen(
+            dataset, efficiency, product_material=product_material, foreign_material=foreign_material
+        )
         return sight_of_references(
             line,
             dataset,
-            product_material=product_material,
-            foreign_material=foreign_material,
+            product_material=product,
+            foreign_material=foreign,
             size=size,
             detector=detector,
             image=image,

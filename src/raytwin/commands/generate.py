@@ -44,10 +44,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--recipe", choices=("raytwin", "as_published"), default="raytwin", help="noise recipe")
     parser.add_argument("--split", choices=("train", "val", "test"), help="use references of this split only")
     parser.add_argument(
-        "--product-material", default="chicken_breast", help="what the product is made of (%(default)s)"
+        "--product-material",
+        metavar="MATERIAL",
+        help="what the product is made of (default: as the references state it, else chicken_breast)",
     )
     parser.add_argument(
-        "--foreign-material", default="rib_bone", help="the second material of another kV or filter (%(default)s)"
+        "--foreign-material",
+        metavar="MATERIAL",
+        help="the second material of another kV or filter (default: as the references state it, else rib_bone)",
     )
     parser.add_argument(
         "--bad-pixels",

@@ -39,12 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--product-material",
         metavar="MATERIAL",
-        help="of the references (default chicken_breast; of --networks the sweep's, of --calibrated the observer's)",
+        help="of the references (default: as they state it, else as --calibrated or --networks has it, else chicken_breast)",
     )
     add(
         "--foreign-material",
         metavar="MATERIAL",
-        help="of the references (default rib_bone; of --networks the sweep's, of --calibrated the observer's)",
+        help="of the references (default: as they state it, else as --calibrated or --networks has it, else rib_bone)",
     )
     add("--size", choices=("contrast", "size_mm"), help="of the references (default: of --calibrated, else contrast)")
     add("--detector", help="ideal (default), hotelling, npw or npwe")

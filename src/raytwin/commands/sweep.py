@@ -97,7 +97,11 @@ def run(arguments: argparse.Namespace) -> int:
     if isinstance(found, SweepPlan):
         rows = result["rows"]
         count = f"{len(rows)} setting{'s' * (len(rows) != 1)}"
-        lines = [*_plan_lines(rows), f"{count}, {result['feasible']} feasible, {result['to_train']} to train"]
+        lines = [
+            *_plan_lines(rows),
+            *(f"warning: {text}" for text in result["warnings"]),
+            f"{count}, {result['feasible']} feasible, {result['to_train']} to train",
+        ]
     else:
         lines = [*_result_lines(by_upper_bound(result["rows"]), result["other_size"]), result["sentence"]]
         lines += _measurement_lines(result["decision"])

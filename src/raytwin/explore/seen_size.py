@@ -71,11 +71,11 @@ def read_networks_observer(
     """A calibrated observer with the objects of a dataset, of the materials with which it was calibrated.
 
     Raises:
-        InputError, FileFormatError: no such files, other kinds of files.
+        InputError, FileFormatError: no such files, other kinds of files, references of other materials.
     """
     efficiency = read_efficiency(path)
-    product, foreign = materials_seen(efficiency, None, None)
     with read_dataset(references) as dataset:
+        product, foreign = materials_seen(dataset, efficiency)
         sight = sight_of_references(
             LineImages(twin),
             dataset,

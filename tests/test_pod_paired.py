@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import raytwin as rt
 from raytwin.pod import LINKS, Trials, check_trials, compare_pod, fit_pod
 from raytwin.pod.paired_spread import difference_spread
 
@@ -25,6 +26,24 @@ def two_exposures(
         hits = (random.random(eta.shape) < LINKS["cloglog"].pod_from_eta(eta)).astype(float)
         tables.append(check_trials(np.tile(size, networks), hits.ravel(), network=network.ravel(), image=image.ravel()))
     return tables
+
+
+def test_images_of_one_name_that_hold_other_objects_are_not_paired():
+    rng = np.random.default_rng(2)
+    names = [f"{number:05d}" for number in range(40)]
+    size = rng.uniform(1.0, 5.0, 40)
+    hit = (rng.random(40) < 1.0 / (1.0 + np.exp(6.0 - 2.0 * size))).astype(int)
+    jars = {"image": names, "size": size, "hit": hit}
+    order = rng.permutation(40)
+    castings = {"image": names, "size": size[order], "hit": hit[order]}
+    again = {"image": names, "size": size * rng.uniform(0.9, 1.1, 40), "hit": hit}  # the same ones, measured anew
+    told = "images of the same name hold objects of other sizes"
+    assert any(told in note for note in rt.compare(jars, castings).warnings)
+    for same in (jars, again):
+        assert not any(told in note for note in rt.compare(jars, same).warnings)
+    assert not any(told in note for note in rt.compare(jars, castings, unpaired=True).warnings)
+    ends = [rt.compare(jars, castings, unpaired=unpaired).comparison.ratio_a90 for unpaired in (False, True)]
+    assert ends[0] == ends[1]
 
 
 def test_intervals_hold_the_noise_of_each_exposure_that_all_networks_see():

@@ -176,7 +176,7 @@ def compare(
         chosen = {default_repeats(table) for table in tables}
         usual = "crossed" if chosen == {"crossed"} else "pooled"
         repeats = _agreed("repeats", None, [fit.repeats for fit in fits], usual)
-    coded, shared = paired_trials(tables, log_size=on_log_size)
+    coded, shared, told = paired_trials(tables, log_size=on_log_size)
     with naming_far_sizes(first_table=tables[0], second_table=tables[1]):
         found = compare_pod(
             coded[0],
@@ -195,7 +195,7 @@ def compare(
         comparison=found,
         size_name=tables[0].size_name,
         repeats=repeats,
-        warnings=(*(note for table in tables for note in table.notes), *found.warnings),
+        warnings=(*(note for table in tables for note in table.notes), *(() if unpaired else told), *found.warnings),
         names=_names(first, second),
     )
 

@@ -121,8 +121,8 @@ def with_links_open(
 
     Returns:
         The fit, its bounds as wide as those of all curves that fit where another one fits better and no link was asked for; those
-        curves joined; a warning where another one fits better. The fit as it came and two times None where looks repeat and are not
-        clusters, hits and misses separate or the fit is not the most likely one.
+        curves joined; a warning where another one fits better. Of clusters the fit as it came, None and the warning; the fit and two
+        times None of random effects, and where hits and misses separate or the fit is not the most likely one.
     """
     times = _looks_a_trial(fit)
     if times is None or fit.method != "ml" or fit.separated:
@@ -134,9 +134,13 @@ def with_links_open(
         return fit, None, None
     best = better_curve(found, own)
     if best is None:
-        return fit, joined, None
-    told = f"another curve fits better: {best.name} ({'AIC' if fit.repeats == 'pooled' else 'QAIC'} lower by"
+        return fit, joined if fit.repeats == "pooled" else None, None
+    clusters = fit.repeats != "pooled"
+    told = f"another curve fits better: {best.name} ({'QAIC' if clusters else 'AIC'} lower by"
     told += f" {(own.aic or 0.0) - (best.aic or 0.0):.3g}"
+    if clusters:
+        a90 = "none" if best.a90 is None else f"{best.a90:.4g}"
+        return fit, None, f"{told}, a90 {a90}); bounds of repeated looks take the link as known"
     if not named and _ends_below_90(best):
         told += "); it ends below 90 %, so there is no a90"
     else:

@@ -277,7 +277,7 @@ def test_bounds_of_a_curve_that_fits_worse_reach_as_far_as_those_of_curves_that_
     assert any("another curve fits better" in text for text in named.warnings)
 
 
-def test_bounds_of_clusters_reach_as_far_where_another_curve_fits_better_and_repeats_count_as_fewer():
+def test_clusters_say_where_another_curve_fits_better_and_repeats_count_as_fewer():
     rng = np.random.default_rng(3)
     size = rng.uniform(0.3, 4.5, 500)
     hit = rng.random(500) < 1.0 / (1.0 + (2.0 / size) ** 5)
@@ -285,21 +285,15 @@ def test_bounds_of_clusters_reach_as_far_where_another_curve_fits_better_and_rep
     thrice = check_trials(
         np.tile(size, 3), np.tile(hit, 3), network=np.repeat(range(3), 500), image=np.tile(range(500), 3)
     )
-
-    def gain_and_told(fit, trials):
-        wide, joined, told = with_links_open(fit, compare_models(trials), named=False)
-        return wide, joined, float(told.split("lower by ")[1].split(",")[0]), told
-
-    _, _, single, _ = gain_and_told(fit_pod(size, hit, link="cloglog"), once)
     fit = fit_pod(
         thrice.size, thrice.hits, link="cloglog", repeats="cluster", network=thrice.network, image=thrice.image
     )
-    wide, joined, gain, told = gain_and_told(fit, thrice)
+    same, joined, told = with_links_open(fit, compare_models(thrice), named=False)
+    assert same == fit and joined is None and "QAIC" in told and "take the link as known" in told
+    _, _, single = with_links_open(fit_pod(size, hit, link="cloglog"), compare_models(once), named=False)
     # looks that are copies of each other say no more than one does
-    assert gain == pytest.approx(single, rel=0.3) and "QAIC" in told
-    true = 2.0 * 9.0**0.2
-    assert wide.a90_low_two_sided.modified <= true <= wide.a90_95_two_sided.modified
-    assert wide.a90_95.modified == max(joined.a90_95, fit.a90_95.modified)
+    gains = [float(text.split("lower by ")[1].split(",")[0]) for text in (told, single)]
+    assert gains[0] == pytest.approx(gains[1], rel=0.3)
 
 
 @pytest.mark.parametrize("log_size", [True, False])

@@ -3,8 +3,7 @@
 Stand-ins take the place of networks: an observer of known efficiency and internal noise whose a90 have an error of their own and a
 scatter between settings, 8 % each, as networks' have (VALIDATION.md). Printed are seconds a setting of looking ahead and of the
 observer, the share of settings that would be trained, and what is recommended: how much larger its a90 is than the smallest one
-(without a goal), or how fast it is (with one), beside what is recommended where all are trained, and what the sweep says that
-training all could still bring.
+(without a goal), or how fast it is (with one), beside what is recommended where all are trained.
 
     python benchmarks/sweep_screening.py CAMPAIGN.toml        # twin and references are its own, the settings this script's
 """
@@ -111,22 +110,19 @@ def main():
             for way, one in {"screening": asked, "all": replace(asked, screening=None)}.items():
                 networks = StandIns(truth)
                 began = time.process_time()
-                answer = run_sweep(
+                answers[way] = run_sweep(
                     one,
                     Path(scratch) / f"{way}_{goal}",
                     runner=networks,
                     version=__version__,
                     outlooks=ahead,
-                )
-                answers[way] = answer["recommended"]
+                )["recommended"]
                 spent = time.process_time() - began
                 share = networks.trained / len(kept)
                 print(
                     f"{way}: {networks.trained} trained ({100 * share:.0f} %), {1000 * spent / len(kept):.0f} ms a setting;"
                     f" {told(answers[way])}"
                 )
-                if way == "screening":
-                    print(f"still to gain: {answer['screening']['still_to_gain']}")
             print("the same setting" if answers["screening"] == answers["all"] else "another setting")
 
 

@@ -10,7 +10,6 @@ from ..reports.chart import Shape
 from ._ticks import few_ticks
 from .decision import FAILS, IMPOSSIBLE, LIKELY, MEETS, OPEN, WORDS, Change, change_text
 from .pod_page import curve_marks
-from .sweep_screening import gain_text
 
 _DASH = "–"
 _ORDER = (MEETS, LIKELY, OPEN, FAILS, IMPOSSIBLE)
@@ -133,7 +132,6 @@ def _screening_text(screening: Mapping[str, Any]) -> str:
     text = f"{screening['trained']} settings were trained; a model observer decided {screening['screened']} others without training."
     if screening["undecided"]:
         text += f" {screening['undecided']} are undecided."
-    text = f"{text} {gain_text(screening)}".strip()
     if observer is None:
         return f"{text} It could not be calibrated: {screening['why_none']}"
     who = observer["observer"]

@@ -8,15 +8,13 @@ recommendation is below 5 %:
     misses    its a90 is smaller than the goal
     slower    never asked: one that is trained reaches the goal, and is faster, or as fast at a lower dose
 
-That is asked of one setting at a time. What all of them together could still bring is said with the answer (`still_to_gain`).
-
 ln a90 of a setting is taken as normal: the observer's mean and interval, together with the networks' own a90 where they were trained.
 What is trained next depends on finished rows alone, so that the answer has the same bytes whatever the number of workers.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,81 +79,36 @@ def decide_candidates(
     candidates: Mapping[str, Candidate], *, goal: float | None, most_false_alarms: float | None
 ) -> dict[str, Decided]:
     """What is decided of every candidate that was not trained, by its text; see the module."""
+    order = _order(candidates)
     open_ones = {text: one for text, one in candidates.items() if not one.trained}
     if goal is not None:
+        reached = [
+            text
+            for text, one in candidates.items()
+            if one.trained and takes_part(one.row, most_false_alarms) and (one.row["a90_upper"] or math.inf) <= goal
+        ]
         chances = {text: _chance_below(one.expected, math.log(goal), 0.0) for text, one in open_ones.items()}
         found = {
             text: Decided(kind=_UNDECIDED if chance >= SMALLEST_CHANCE else "misses", chance=chance)
             for text, chance in chances.items()
         }
-        taken = _reaches(candidates, goal, most_false_alarms)
-        if taken is not None:
-            order = _order(candidates)
+        if reached:
+            taken = min(reached, key=lambda text: order[text])
             return {
                 text: Decided(kind="slower") if order[text] > order[taken] and one.kind == _UNDECIDED else one
                 for text, one in found.items()
             }
         if any(one.kind == _UNDECIDED for one in found.values()):
             return found
-    best = _smallest(candidates, most_false_alarms)
-    if best is None:
+    best = [_best_of(one) for one in candidates.values() if one.trained and takes_part(one.row, most_false_alarms)]
+    if not best:
         return {text: Decided(kind=_UNDECIDED) for text in open_ones}
-    mean, sd = best
+    mean, sd = min(best)
     chances = {text: _chance_below(one.expected, mean, sd) for text, one in open_ones.items()}
     return {
         text: Decided(kind=_UNDECIDED if chance >= SMALLEST_CHANCE else "worse", chance=chance)
         for text, chance in chances.items()
     }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StillToGain:
-    """What training all settings that were not trained could bring. One by one they seem not worth it; hundreds together may be.
-
-    Fields: chance (that one of them would be recommended); a90_share (by which the smallest a90 would fall on average; None: a
-    setting reaches the goal, or of one of them nothing is expected).
-    """
-
-    chance: float
-    a90_share: float | None
-
-
-def still_to_gain(
-    candidates: Mapping[str, Candidate],
-    decided: Mapping[str, Decided],
-    *,
-    goal: float | None,
-    most_false_alarms: float | None,
-) -> StillToGain:
-    """What the settings that were not trained could bring, the observer's errors taken as independent from setting to setting."""
-    taken = None if goal is None else _reaches(candidates, goal, most_false_alarms)
-    order = _order(candidates)
-    rivals = [text for text in decided if taken is None or order[text] < order[taken]]
-    chances = [decided[text].chance for text in rivals]
-    chance = 1.0 - math.prod(0.5 if one is None else 1.0 - one for one in chances)
-    best = _smallest(candidates, most_false_alarms)
-    expected = [candidates[text].expected for text in rivals]
-    known = [one for one in expected if one is not None]
-    if taken is not None or best is None or len(known) < len(expected):
-        return StillToGain(chance=chance, a90_share=None)
-    return StillToGain(chance=chance, a90_share=-math.expm1(-_mean_fall(known, best[0])))
-
-
-def _mean_fall(expected: Sequence[Expected], log_best: float) -> float:
-    """By how much the smallest ln a90 of settings lies below that of the best on average, 0 where it does not.
-
-    The integral, up to the best, of the chance that any lies below (expected improvement: Jones, Schonlau, Welch, J. Global
-    Optim. 13 (1998) 455, doi:10.1023/A:1008306431147, of several at once).
-    """
-    from scipy.special import log_ndtr
-
-    if not expected:
-        return 0.0
-    mean = np.array([math.log(one.value) for one in expected])
-    sd = np.maximum([one.log_sd for one in expected], 1e-9)
-    below = np.linspace(min(float(np.min(mean - 8.0 * sd)), log_best), log_best, 2001)
-    any_below = -np.expm1(np.sum(log_ndtr((mean - below[:, None]) / sd), axis=1))
-    return float(np.trapezoid(any_below, below))
 
 
 def next_to_train(
@@ -189,23 +142,6 @@ def first_to_train(sizes: Mapping[str, float], *, count: int, largest: float) ->
         return [*clear, *rest][:count]
     places = np.linspace(0, len(clear) - 1, count).round().astype(int)
     return [clear[place] for place in places]
-
-
-def _reaches(candidates: Mapping[str, Candidate], goal: float, most_false_alarms: float | None) -> str | None:
-    """The trained setting that reaches the goal and is preferred to others that do."""
-    order = _order(candidates)
-    reached = (
-        text
-        for text, one in candidates.items()
-        if one.trained and takes_part(one.row, most_false_alarms) and (one.row["a90_upper"] or math.inf) <= goal
-    )
-    return min(reached, key=lambda text: order[text], default=None)
-
-
-def _smallest(candidates: Mapping[str, Candidate], most_false_alarms: float | None) -> tuple[float, float] | None:
-    """Mean and deviation of the smallest ln a90 of settings that were trained."""
-    best = (_best_of(one) for one in candidates.values() if one.trained and takes_part(one.row, most_false_alarms))
-    return min(best, default=None)
 
 
 def _order(candidates: Mapping[str, Candidate]) -> dict[str, tuple[float, float, str]]:
@@ -429,18 +365,7 @@ class Screened:
         """How many settings were trained, and what became of the others, in words."""
         trained, decided, left = (self.answer[name] for name in ("trained", "screened", "undecided"))
         text = f"{trained} settings were trained; the observer decided {decided} without training"
-        text += "." if not left else f" and left {left} undecided."
-        return f"{text} {gain_text(self.answer)}".strip()
-
-
-def gain_text(answer: Mapping[str, Any]) -> str:
-    """What the settings that were not trained could bring, in words; empty where all were."""
-    still = answer["still_to_gain"]
-    if not answer["screened"] + answer["undecided"]:
-        return ""
-    text = f"With a chance of {still['chance']:.2g} training all would change the recommendation"
-    share = still["a90_share"]
-    return f"{text}." if share is None else f"{text}; a90 would fall by {100 * share:.1f} % on average."
+        return f"{text}." if not left else f"{text} and left {left} undecided."
 
 
 def outlooks_of_rows(rows: Sequence[Mapping[str, Any]]) -> list[Outlook]:
@@ -491,9 +416,6 @@ def screened_rows(screen: Screen, rows: Mapping[str, dict[str, Any]], asked: Seq
             "undecided": sum(one.kind == _UNDECIDED for one in decided.values()),
             "calibrating": [text for text in asked if text in calibrating],
             "observer": None if efficiency is None else efficiency_to_mapping(efficiency),
-            "still_to_gain": asdict(
-                still_to_gain(candidates, decided, goal=campaign.goal, most_false_alarms=campaign.most_false_alarms)
-            ),
             "left_out_rms": None if efficiency is None else efficiency.left_out_rms,
             "why_none": screen.why_none,
             "warnings": [] if efficiency is None else list(efficiency.warnings),

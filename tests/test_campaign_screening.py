@@ -17,11 +17,9 @@ from raytwin.campaign.sweep_screening import (
     Candidate,
     Expected,
     Screen,
-    StillToGain,
     decide_candidates,
     first_to_train,
     next_to_train,
-    still_to_gain,
 )
 from raytwin.campaign.sweep_trial import basis_of, prepare_references
 from raytwin.errors import FileFormatError, InputError
@@ -149,9 +147,6 @@ def test_the_recommendation_is_that_of_training_all_at_a_third_of_the_cost(line,
     assert {row["decided"] for row in rows if not row["trained"]} <= {"worse", "misses", "slower"}
     assert all(row["reason"].startswith("not trained: ") for row in rows if not row["trained"])
     assert screened["screening"]["trained"] == len(networks.trained)
-    still = screened["screening"]["still_to_gain"]
-    assert 0.0 <= still["chance"] < 0.9 and (still["a90_share"] is None) == bool(goal)
-    assert "training all would change the recommendation" in screened["sentence"]
     observer = screened["screening"]["observer"]["observer"]
     assert observer["efficiency"] == pytest.approx(0.5, rel=0.4)
 
@@ -254,23 +249,6 @@ def test_what_is_likely_worse_than_the_best_is_decided():
     settings = {"best": candidate(0.1), "near": candidate(expected=0.11), "far": candidate(expected=0.2)}
     found, _ = kinds(settings)
     assert found == {"near": "undecided", "far": "worse"}
-
-
-def test_what_hundreds_of_settings_could_still_bring_together_is_said():
-    rng = np.random.default_rng(3)
-    sizes = 0.1 * np.exp(rng.uniform(0.18, 0.4, 400))
-    settings = {"best": candidate(0.1)} | {f"{number}": candidate(expected=size) for number, size in enumerate(sizes)}
-    found, decided = kinds(settings)
-    assert set(found.values()) == {"worse"}  # each by itself
-    still = still_to_gain(settings, decided, goal=None, most_false_alarms=None)
-    drawn = np.log(sizes / 0.1) + 0.1 * rng.standard_normal((20_000, sizes.size))
-    fall = np.maximum(-drawn.min(axis=1), 0.0)
-    assert still.a90_share == pytest.approx(np.mean(fall), rel=0.1)
-    assert np.mean(fall > 0.0) - 0.03 < still.chance <= 1.0  # the best's own error counts as well
-    # of those that are slower than the one that reaches the goal nothing is to be gained
-    quick = {"best": candidate(0.1, pace=2.0), "slow": candidate(expected=0.1, pace=1.0)}
-    _, decided = kinds(quick, 0.2)
-    assert still_to_gain(quick, decided, goal=0.2, most_false_alarms=None) == StillToGain(chance=0.0, a90_share=None)
 
 
 def test_with_a_goal_the_fastest_that_may_reach_it_are_trained_first():
